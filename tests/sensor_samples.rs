@@ -130,6 +130,25 @@ fn the_sensor_of_kitti_is_recognized_by_a_drive() {
 }
 
 #[test]
+fn the_beams_of_kitti_are_64_in_compensated_scans_of_its_benchmark() {
+    for recording in [
+        "kitti-odometry-01",
+        "semantickitti-00-labels",
+        "semantickitti-08-labels",
+    ] {
+        let Some(folder) = common::real_recording(recording) else {
+            continue;
+        };
+        let (_, sensor) = sensor_of(&folder.join("velodyne"), 1, 10);
+        assert_eq!(sensor.beams, Some(64), "{recording}");
+        assert!(
+            (62..=64).contains(&sensor.range_image.height),
+            "{recording}"
+        );
+    }
+}
+
+#[test]
 fn the_sensor_of_nuscenes_is_recognized_by_a_drive() {
     let Some(folder) = common::real_recording("nuscenes-hdl32") else {
         return;

@@ -382,3 +382,66 @@ fn keys_of_a_sensor_have_units_and_those_of_earlier_maps_are_read() {
         assert_eq!(serde_json::from_str::<Sensor>(&text).unwrap(), sensor);
     }
 }
+
+#[test]
+fn beams_are_whole_though_the_ends_of_a_compensated_sweep_overlap() {
+    let mut rng = ChaCha8Rng::seed_from_u64(12);
+    // Velodyne's HDL-64E: two blocks of 32 lasers with two spacings, mounted 0.2 degrees too high.
+    let upper = (0..32).map(|laser| 2.2 - laser as f32 / 3.0);
+    let lower = (0..32).map(|laser| -8.63 - 0.5 * laser as f32);
+    let sensor = Spinner {
+        elevations_deg: upper.chain(lower).collect(),
+        columns: 1800,
+        offset_m: 0.0,
+    };
+    let scans = [0.0, 2.0, 4.0].map(|place_m| {
+        let scan = sensor.scan(place_m, &mut rng);
+        let columns: Vec<&[Vec3]> = scan.points.chunks(64).collect();
+        // The sweep starts behind; files start in front. It moves by 8 cm, and turns by 363 degrees.
+        let moved = |column: usize, turns: f32| {
+            let later = move |point: &Vec3| *point + 0.08 * turns * Vec3::X;
+            columns[column].iter().map(later).collect::<Vec<_>>()
+        };
+        let share = |column: usize| (column as f32 + 0.5) / 1800.0;
+        let first = (0..908).map(|column| moved(column, share(column)));
+        let second = (893..1800).map(|column| moved(column, share(column) - 1.0));
+        let ordered: Vec<Vec<Vec3>> = first.chain(second).collect();
+        Scan {
+            points: (0..64)
+                .flat_map(|beam| ordered.iter().map(move |column| column[beam]))
+                .collect(),
+            ..Scan::default()
+        }
+    });
+    let found = infer(&scans);
+    assert_eq!(found.beam_source, BeamSource::Order);
+    assert_eq!((found.beams, found.range_image.height), (Some(64), 64));
+    for (row, expected) in sensor.elevations_deg.iter().enumerate() {
+        let error = found.range_image.elevation_rad(row).to_degrees() - expected;
+        assert!(error.abs() < 0.05, "row {row}: {error}");
+    }
+}
+
+#[test]
+fn a_scan_with_more_beams_than_most_does_not_count() {
+    let mut rng = ChaCha8Rng::seed_from_u64(13);
+    let sensor = Spinner::draw(&mut rng, 20);
+    let scans = [20, 20, 23].map(|beams| {
+        let scan = sensor.scan(0.0, &mut rng);
+        let beam = |beam: usize| {
+            // Returns from elsewhere in three turns below the others.
+            let lower = if beam < 20 { 0.0 } else { beam as f32 };
+            let points = scan.points.iter().skip(beam % 20).step_by(20);
+            points.map(move |&point| point - lower * Vec3::Z)
+        };
+        Scan {
+            points: (0..beams).flat_map(beam).collect(),
+            ..Scan::default()
+        }
+    });
+    let found = infer(&scans);
+    assert_eq!(
+        (found.beam_source, found.beams),
+        (BeamSource::Order, Some(20))
+    );
+}
