@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 use fpmcl::geometry::{Pose2, Pose3, Vec3, pose2_from_pose3};
 use fpmcl::internals::app::{LineChart, Panel, Series};
 use fpmcl::internals::{PERIOD_S, compare_timings};
-use fpmcl::lidar::{Beam, LidarModel, RangeImage, Rotation, Scan};
+use fpmcl::lidar::{Beam, LidarModel, RangeImage, Scan};
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start, StartSpread};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::odometry::OdometryConfig;
@@ -141,9 +141,9 @@ fn frames(recording: &Path, map: &Map) -> Result<Vec<(Scan, Pose3)>, Failure> {
     let has_times = first.iter().any(|scan| !scan.times_s.is_empty());
     let timing = compare_timings(&first, PERIOD_S, &OdometryConfig::default())?;
     let best = timing.best.filter(|_| !has_times);
-    let rotation: Option<Rotation> = best.and_then(|best| timing.residuals_m[best].0);
+    let timing = best.and_then(|best| timing.residuals_m[best].0);
     let track = recording.own_track()?.in_map(&map.path.world_from_map);
-    let recording = recording.rotating(rotation).with_poses(track)?;
+    let recording = recording.timed(timing).with_poses(track)?;
     let odd = recording.compensated_by_poses().frames.into_iter();
     odd.filter(|frame| frame.number % 2 == 1)
         .filter_map(|frame| {

@@ -372,3 +372,43 @@ fn a_sensor_of_another_kind_is_found_anywhere_at_two_scans_a_second() {
     assert!(position["rmse"].as_f64().unwrap() < 0.05, "{position}");
     assert!(position["max"].as_f64().unwrap() < 0.5, "{position}");
 }
+
+#[test]
+fn scans_that_start_elsewhere_each_time_are_compensated_by_the_order_of_their_points() {
+    let Some(data) = real_recording("vlp16-raw") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (folder, data) = (folder.path(), data.display().to_string());
+    let output = map_even_frames(folder, &data);
+    for part in ["16 beams", "motion compensation: order;"] {
+        assert!(output.stderr.contains(part), "{}", output.stderr);
+    }
+    let report = localize_odd_frames(folder, &data, &[]);
+    assert_eq!(report["summary"]["tracking"], 30);
+    // 0.90 without times of the points.
+    let agreement = report["summary"]["agreement"]["median"].as_f64().unwrap();
+    assert!(agreement > 0.92, "{agreement}");
+}
+
+#[test]
+fn scans_of_more_than_a_turn_and_with_gaps_between_them_are_compensated_by_their_order() {
+    let Some(data) = real_recording("hdl32-gaps") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let output = fpmcl("odometry")
+        .in_folder(folder.path())
+        .with(data.display().to_string())
+        .set("output_folder", "odometry")
+        .succeeds();
+    let text = fs::read_to_string(folder.path().join("odometry/effective_odometry.yml")).unwrap();
+    let key = text
+        .lines()
+        .find(|line| line.contains("motion_compensation"));
+    assert!(
+        key.unwrap().contains("order over 400."),
+        "{key:?} {}",
+        output.stderr
+    );
+}

@@ -31,7 +31,7 @@ use fpmcl::internals::app::settings::{
 use fpmcl::internals::app::{Cli, Command};
 use fpmcl::internals::ply;
 use fpmcl::internals::scan_files;
-use fpmcl::lidar::{Rotation, RotationDirection, Scan};
+use fpmcl::lidar::{PointTiming, Rotation, RotationDirection, Scan};
 use fpmcl::recording::{Calibration, Recording};
 use fpmcl::recording::{read_labels, write_labels, write_scan};
 use fpmcl::recording::{read_times, read_tum, write_kitti, write_times, write_tum};
@@ -266,11 +266,11 @@ fn recordings() {
                 assert!(position.iter().all(|m| m.is_finite()));
             }
             for frame in &sequence
-                .rotating(Some(Rotation {
+                .timed(Some(PointTiming::Rotation(Rotation {
                     start_rad: 0.4,
                     direction: RotationDirection::Clockwise,
                     period_s: 0.1,
-                }))
+                })))
                 .compensated_by_poses()
                 .frames
             {

@@ -274,7 +274,7 @@ pub fn without_poses() -> PyErr {
 /// recording contains, if there are any. ``calib_file``: calibration of the camera whose poses these are.
 /// ``body_from_lidar``: x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses these are. ``topic``: of the
 /// point clouds in a bag with several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used.
-/// ``motion_compensation``: ``"auto"``, a rotation such as ``"clockwise"``, or None for compensated scans.
+/// ``motion_compensation``: ``"auto"``, ``"order"``, a rotation such as ``"clockwise"``, or None for compensated scans.
 /// ``elevation_bias_deg``: angle to add to the elevations of all points [deg].
 ///
 /// Raises Error if something cannot be read, with the file, and what to do.

@@ -5,10 +5,9 @@ use nalgebra::{Point3, Vector3};
 use rand::{SeedableRng as _, rngs::StdRng};
 use rand_distr::{Distribution as _, StandardNormal};
 
-use super::timing::order_of_firing;
 use super::*;
 use crate::geometry::{Pose3, wrap_angle};
-use crate::lidar::{Rotation, RotationDirection, Scan};
+use crate::lidar::{PointTiming, Rotation, RotationDirection, Scan};
 
 /// Surfaces: planes n · p = d within a box, and upright cylinders (x, y, radius) up to a height.
 #[derive(Default)]
@@ -425,6 +424,9 @@ fn the_times_that_fit_are_found() {
             ..CLOCKWISE
         };
         let found = best(&drive_scans(8, Some(rotation))).flatten().unwrap();
+        let PointTiming::Rotation(found) = found else {
+            panic!("{found:?}")
+        };
         let apart_rad = wrap_angle(found.start_rad - rotation.start_rad);
         assert_eq!(found.direction, direction, "{start_deg}");
         assert!(apart_rad.abs() < 0.01, "{start_deg}: {apart_rad}");
@@ -436,31 +438,42 @@ fn the_times_that_fit_are_found() {
 }
 
 #[test]
-fn the_order_of_firing_shows_where_a_revolution_starts() {
-    for (direction, sense) in [
-        (RotationDirection::Clockwise, -1.0_f32),
-        (RotationDirection::CounterClockwise, 1.0),
+fn the_order_of_the_points_fits_where_each_scan_starts_elsewhere_unless_they_are_compensated() {
+    let config = OdometryConfig::default();
+    let world = World::crossing();
+    for direction in [
+        RotationDirection::Clockwise,
+        RotationDirection::CounterClockwise,
     ] {
-        for start in [0.3_f32, -2.0, 3.0] {
-            let azimuths = (0..3600).flat_map(|step| {
-                let azimuth = start + sense * std::f32::consts::TAU * step as f32 / 3600.0;
-                // Beams of one column are up to 3 degrees apart.
-                [0.0, 0.05, -0.05].map(|aside| azimuth + aside)
-            });
-            let points: Vec<Vec3> = azimuths
-                .map(|azimuth| 9.0 * Vec3::new(azimuth.cos(), azimuth.sin(), 0.1))
-                .collect();
-            let scan = |points| Scan {
-                points,
-                ..Scan::default()
+        for are_compensated in [false, true] {
+            let scan = |number: usize| {
+                let time_s = 0.1 * number as f64;
+                let rotation = Rotation {
+                    direction,
+                    start_rad: 1.9 * (number * number) as f64,
+                    ..CLOCKWISE
+                };
+                let moved = |after_s| drive(time_s + after_s);
+                let scan = world.scan(moved, Some(rotation).filter(|_| !are_compensated));
+                // In the order in which they were measured.
+                let times_s = rotation.point_times(&scan.points);
+                let mut order: Vec<usize> = (0..scan.len()).collect();
+                order.sort_by(|&a, &b| times_s[a].total_cmp(&times_s[b]));
+                Scan {
+                    points: order.iter().map(|&point| scan.points[point]).collect(),
+                    time_s: Some(time_s),
+                    ..Scan::default()
+                }
             };
-            let found = order_of_firing(&scan(points.clone()));
-            let (found, start_rad) = found.unwrap();
-            assert_eq!(found, direction);
-            assert!((start_rad - f64::from(start)).abs() < 0.06, "{start_rad}");
-            // One beam after the other, as in the files of KITTI.
-            let rows = (0..3).flat_map(|beam| points.iter().skip(beam).step_by(3));
-            assert_eq!(order_of_firing(&scan(rows.copied().collect())), None);
+            let scans: Vec<Scan> = (0..8).map(scan).collect();
+            let found = compare_timings(&scans, 0.1, &config).unwrap();
+            let residuals_m = &found.residuals_m;
+            assert!(matches!(residuals_m[1].0, Some(PointTiming::Order { .. })));
+            assert_eq!(
+                found.best,
+                Some(usize::from(!are_compensated)),
+                "{residuals_m:?}"
+            );
         }
     }
 }

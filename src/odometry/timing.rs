@@ -5,24 +5,26 @@
 //! one. Near the right times it grows with the square of the error: the residual of compensated scans,
 //! candidates none (0), clockwise (1) and counter-clockwise (−1), is that of 0 by the same amount below both
 //! others, that of clockwise scans by one quarter of the whole range below the next. The scan of a sensor at rest has
-//! the same residual with all candidates.
+//! the same residual with all candidates. Scans in the order in which their points were measured, which start at
+//! different azimuths, have that order as the only other candidate.
 
-use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
+use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 
 use rayon::prelude::*;
 
 use super::config::OdometryConfig;
 use super::odometer::{Odometer, OdometryError};
 use crate::geometry::wrap_angle;
-use crate::lidar::{Rotation, RotationDirection, Scan};
+use crate::lidar::{FiringOrder, PointTiming, Rotation, RotationDirection, Scan};
+use crate::statistics::median;
 use crate::validation::{InvalidValue, Validate as _};
 
 /// Residuals of the odometry with each candidate for the times of the points.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimingComparison {
-    /// The candidates, `None` for points without times, then clockwise and counter-clockwise, each with the start of
-    /// the revolution that fits it best, with the mean residual of the odometry [m].
-    pub residuals_m: Vec<(Option<Rotation>, f64)>,
+    /// The candidates, `None` for points without times, then the order of the points, or clockwise and
+    /// counter-clockwise with the start of the revolution that fits each best, with the mean residual of the odometry [m].
+    pub residuals_m: Vec<(Option<PointTiming>, f64)>,
     /// Index of the candidate that fits; `None` if the residuals do not decide, as without motion.
     pub best: Option<usize>,
 }
@@ -38,8 +40,8 @@ pub enum TimingError {
     Odometry(#[from] OdometryError),
 }
 
-/// Compares the times of the points of a sensor that turns once in a period [s] with none, on consecutive scans, ten or
-/// more with motion. Times that the scans have are ignored.
+/// Compares the times of the points of a sensor that turns once, or from the start of a scan to that of the next, in a
+/// period [s] with none, on consecutive scans, ten or more with motion. Times that the scans have are ignored.
 pub fn compare_timings(
     scans: &[Scan],
     period_s: f64,
@@ -52,65 +54,67 @@ pub fn compare_timings(
         ..config.clone()
     };
     let runs = Runs { scans, config };
-    let order = scans.first().and_then(order_of_firing);
     let mut residuals_m = vec![(None, runs.mean_residual(None)?)];
+    if let Some(period_s) = period_of_order(scans, period_s) {
+        let timing = Some(PointTiming::Order { period_s });
+        residuals_m.push((timing, runs.mean_residual(timing)?));
+        return Ok(TimingComparison::decided(residuals_m));
+    }
+    let order = scans.first().and_then(FiringOrder::of);
     for direction in [
         RotationDirection::Clockwise,
         RotationDirection::CounterClockwise,
     ] {
-        let from_order = order.filter(|(fired, _)| *fired == direction);
+        let from_order = order.as_ref().filter(|it| it.direction == direction);
         let rotation = |start_rad| Rotation {
             direction,
             period_s,
             start_rad,
         };
-        let first = rotation(from_order.map_or(PI, |(_, start_rad)| start_rad));
+        let first = rotation(from_order.map_or(PI, |it| it.start_rad));
         let (rotation, residual_m) = runs.best_start(first)?;
-        residuals_m.push((Some(rotation), residual_m));
+        residuals_m.push((Some(PointTiming::Rotation(rotation)), residual_m));
     }
-    let values: Vec<f64> = residuals_m.iter().map(|(_, m)| *m).collect();
-    Ok(TimingComparison {
-        best: decide(&values),
-        residuals_m,
-    })
+    Ok(TimingComparison::decided(residuals_m))
 }
 
-/// Sense of rotation, and azimuth at which a revolution starts [rad], of points in the order in which a spinning sensor
-/// measured them; `None` of points in another order, such as one beam after the other.
-pub fn order_of_firing(scan: &Scan) -> Option<(RotationDirection, f64)> {
-    /// Turns from the first to the last point.
-    const TURNS: std::ops::RangeInclusive<f64> = 0.9..=1.1;
-    /// Largest step back: beams of one moment have different azimuths [rad].
-    const ASIDE_RAD: f64 = 0.35;
-    /// Nearer points have no direction [m].
-    const NEAREST_M: f32 = 0.1;
-    let is_valid = |point: &&glam::Vec3| point.is_finite() && point.length() > NEAREST_M;
-    let azimuths: Vec<f64> = (scan.points.iter().filter(is_valid))
-        .map(|point| f64::from(point.y.atan2(point.x)))
-        .collect();
-    let start_rad = *azimuths.first()?;
-    let steps = azimuths
-        .windows(2)
-        .map(|pair| wrap_angle(pair[1] - pair[0]));
-    let turned: Vec<f64> = steps
-        .scan(0.0, |turned, step| {
-            *turned += step;
-            Some(*turned)
-        })
-        .collect();
-    let last = *turned.last()?;
-    let mut farthest = 0.0_f64;
-    let is_steady = turned.iter().all(|turned| {
-        let along = turned * last.signum();
-        farthest = farthest.max(along);
-        along >= farthest - ASIDE_RAD
-    });
-    let direction = if last > 0.0 {
-        RotationDirection::CounterClockwise
-    } else {
-        RotationDirection::Clockwise
+impl TimingComparison {
+    fn decided(residuals_m: Vec<(Option<PointTiming>, f64)>) -> Self {
+        let values: Vec<f64> = residuals_m.iter().map(|(_, m)| *m).collect();
+        Self {
+            best: decide(&values),
+            residuals_m,
+        }
+    }
+}
+
+/// Duration of a turn of a sensor with an interval between its scans [s], if their points are in the order in which they
+/// were measured and show it by the azimuths at which they start; `None` of others. Scans may be missing between them.
+fn period_of_order(scans: &[Scan], interval_s: f64) -> Option<f64> {
+    /// Median deviation of the angles between the starts of scans that show the speed of rotation: 0.1 degrees for an
+    /// HDL-32 and a VLP-16, 90 degrees for starts at random, whose scans are taken as a turn each [rad].
+    const EVEN_RAD: f64 = TAU / 36.0;
+    let scans: Vec<&Scan> = scans.iter().filter(|scan| !scan.is_empty()).collect();
+    let orders: Option<Vec<FiringOrder>> = scans.iter().map(|scan| FiringOrder::of(scan)).collect();
+    let orders = orders?;
+    let first = orders.first()?;
+    let is_one_sense = orders.iter().all(|it| it.direction == first.direction);
+    if !is_one_sense || !FiringOrder::pass_all_azimuths(&orders) {
+        return None;
+    }
+    let steps = |pair: &[&Scan]| match (pair[0].time_s, pair[1].time_s) {
+        (Some(before_s), Some(time_s)) => ((time_s - before_s) / interval_s).round().max(1.0),
+        _ => 1.0,
     };
-    (is_steady && TURNS.contains(&(last.abs() / (2.0 * PI)))).then_some((direction, start_rad))
+    // A sector without returns matters less over fewer scans.
+    let least = scans.windows(2).map(steps).reduce(f64::min)?;
+    let sweeps_rad: Vec<f64> = (orders.windows(2).zip(scans.windows(2)))
+        .filter(|(_, scans)| steps(scans) == least)
+        .map(|(orders, _)| orders[0].angle_to(&orders[1], least) / least)
+        .collect();
+    let usual_rad = median(sweeps_rad.iter().copied())?;
+    let is_even = median(sweeps_rad.iter().map(|rad| (rad - usual_rad).abs()))? < EVEN_RAD;
+    Some(interval_s * TAU / if is_even { usual_rad } else { TAU })
 }
 
 /// Runs of the odometry over the same scans.
@@ -125,7 +129,10 @@ impl Runs<'_> {
     fn best_start(&self, first: Rotation) -> Result<(Rotation, f64), TimingError> {
         /// Decrease of the residual by which another start than the first is better (unitless).
         const BETTER: f64 = 0.03;
-        let mut best = (first, self.mean_residual(Some(first))?);
+        let mut best = (
+            first,
+            self.mean_residual(Some(PointTiming::Rotation(first)))?,
+        );
         let mut better = BETTER;
         for turns in [
             &[FRAC_PI_2, PI, -FRAC_PI_2][..],
@@ -137,7 +144,10 @@ impl Runs<'_> {
                 ..best.0
             };
             let others: Vec<Rotation> = turns.iter().map(turned).collect();
-            let residual = |&other: &Rotation| Ok((other, self.mean_residual(Some(other))?));
+            let residual = |&other: &Rotation| {
+                let timing = Some(PointTiming::Rotation(other));
+                Ok((other, self.mean_residual(timing)?))
+            };
             let found: Result<Vec<_>, TimingError> = others.par_iter().map(residual).collect();
             for (other, residual_m) in found? {
                 if residual_m < (1.0 - better) * best.1 {
@@ -154,13 +164,12 @@ impl Runs<'_> {
     }
 
     /// Mean residual of the registered scans; infinite if there are none [m].
-    fn mean_residual(&self, candidate: Option<Rotation>) -> Result<f64, TimingError> {
+    fn mean_residual(&self, candidate: Option<PointTiming>) -> Result<f64, TimingError> {
         let mut odometer = Odometer::new(self.config.clone())?;
         let (mut sum_m, mut count) = (0.0, 0);
         for scan in self.scans {
             let mut scan = scan.clone();
-            scan.times_s =
-                candidate.map_or_else(Vec::new, |rotation| rotation.point_times(&scan.points));
+            scan.times_s = candidate.map_or_else(Vec::new, |timing| timing.point_times(&scan));
             if let Some(residual_m) = odometer.step(&scan)?.residual_m {
                 sum_m += residual_m;
                 count += 1;

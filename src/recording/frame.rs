@@ -9,7 +9,7 @@ use super::bags::Bag;
 use super::error::RecordingError;
 use super::scan_files;
 use crate::geometry::{Pose3, StampedPose};
-use crate::lidar::{Motion, Rotation, Scan};
+use crate::lidar::{Motion, PointTiming, Scan};
 
 /// Where a scan is stored.
 #[derive(Clone, Debug)]
@@ -68,8 +68,8 @@ pub struct Frame {
     pub time_s: f64,
     /// Given pose, `p_map = map_from_lidar * p_lidar`.
     pub map_from_lidar: Option<Pose3>,
-    /// Rotation of the sensor, from which the times of the points follow where the file has none.
-    pub rotation: Option<Rotation>,
+    /// Source of the times of the points where the file has none.
+    pub timing: Option<PointTiming>,
     /// Whether the points have times; otherwise the scan is taken as compensated.
     pub is_timed: bool,
     /// Angle that is added to the elevations of all points when the scan is read [rad].
@@ -86,7 +86,7 @@ impl Frame {
             source,
             time_s,
             map_from_lidar: None,
-            rotation: None,
+            timing: None,
             is_timed: true,
             elevation_bias_rad: 0.0,
             motion: None,
@@ -101,10 +101,10 @@ impl Frame {
         let mut scan = self.source.read()?;
         scan.time_s = scan.time_s.or(Some(self.time_s));
         scan.raise(self.elevation_bias_rad);
-        if let (true, Some(rotation)) = (scan.times_s.is_empty(), &self.rotation) {
-            scan.times_s = rotation.point_times(&scan.points);
+        if let (true, Some(timing)) = (scan.times_s.is_empty(), &self.timing) {
+            scan.times_s = timing.point_times(&scan);
         }
-        if !matches!(self.source, ScanSource::Memory(_)) || self.rotation.is_some() {
+        if !matches!(self.source, ScanSource::Memory(_)) || self.timing.is_some() {
             scan.center_times();
         }
         if !self.is_timed {

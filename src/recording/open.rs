@@ -16,7 +16,7 @@ use super::scan_files;
 use super::scan_list::{self, ScanFile, Selection};
 use super::track::PoseTrack;
 use crate::geometry::Pose3;
-use crate::lidar::{Rotation, Scan};
+use crate::lidar::{PointTiming, Scan};
 
 /// Revolutions per second of the sensor, for recordings without times.
 const SCANS_PER_SECOND: f64 = 10.0;
@@ -337,11 +337,11 @@ impl Recording {
         self
     }
 
-    /// The same recording, whose points have times from the rotation of the sensor where the data have none.
+    /// The same recording, whose points have times where the data have none.
     #[must_use]
-    pub fn rotating(mut self, rotation: Option<Rotation>) -> Self {
+    pub fn timed(mut self, timing: Option<PointTiming>) -> Self {
         for frame in self.frames.iter_mut().chain(&mut self.skipped) {
-            frame.rotation = rotation;
+            frame.timing = timing;
         }
         self
     }

@@ -6,14 +6,17 @@ use super::beams::{self, BeamSource};
 use super::config::{MotionCompensation, SensorConfig};
 use super::dropped::DroppedPoints;
 use super::mounting::{self, Surroundings};
-use super::{Sensor, columns, own_car, projection, rotation};
+use super::{Sensor, columns, own_car, projection, raw, rotation};
 use crate::geometry::wrap_angle;
-use crate::lidar::{LidarModel, PERIOD_S, Rotation, Scan};
+use crate::lidar::{LidarModel, PERIOD_S, PointTiming, Scan};
 use crate::odometry::{OdometryConfig, TimingComparison, TimingError, compare_timings};
 use crate::recording::{Frame, Recording, RecordingError};
 
 /// Number of scans from which a sensor is inferred.
 pub const SENSOR_SCANS: usize = 10;
+
+/// What to set where nothing shows the times of the points.
+const SET_TIMES: &str = "set motion_compensation to null if they are compensated, else to order, clockwise or counter_clockwise";
 
 /// Number of consecutive scans that show the times of points.
 pub const TIMING_SCANS: usize = 16;
@@ -96,12 +99,8 @@ impl Sensor {
         tracing::info!("sensor: {sensor}");
         sensor.warn_of_dropped_points(&scans);
         if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
-            let compared = if sensor.is_spinning() {
-                timings_of_recording(recording)?
-            } else {
-                None
-            };
-            sensor.motion_compensation = compared.as_ref().and_then(fitting_rotation);
+            sensor.motion_compensation =
+                sensor.timing(&scans, || timings_of_recording(recording))?;
         }
         Ok(sensor)
     }
@@ -161,39 +160,35 @@ impl Sensor {
         if self.motion_compensation == Some(MotionCompensation::Auto)
             && scans.iter().all(|scan| scan.times_s.is_empty())
         {
-            let compared = if self.is_spinning() {
-                timings_of(scans, self.period_s.unwrap_or(PERIOD_S))?
-            } else {
-                None
-            };
-            self.motion_compensation = compared.as_ref().and_then(fitting_rotation);
+            let interval_s = self.period_s.unwrap_or(PERIOD_S);
+            self.motion_compensation = self.timing(scans, || timings_of(scans, interval_s))?;
         }
         Ok(true)
     }
 
-    /// The recording, whose points have times from the rotation of the sensor where the data have none; without motion
-    /// compensation, times of the data are ignored.
+    /// The recording, whose points have times where the data have none; without motion compensation, times of the data
+    /// are ignored.
     pub fn applied_to(&self, recording: Recording) -> Recording {
         let Some(compensation) = self.motion_compensation else {
             return recording.compensated();
         };
-        let rotation = compensation.rotation(period_s(&recording).unwrap_or(PERIOD_S));
-        recording.rotating(rotation)
+        let interval_s = period_s(&recording).unwrap_or(PERIOD_S);
+        recording.timed(compensation.timing(interval_s))
     }
 
-    /// A scan whose points have times from the rotation of the sensor where the data have none; without motion
-    /// compensation, times of the data are ignored.
+    /// A scan whose points have times where the data have none; without motion compensation, times of the data are
+    /// ignored.
     pub(crate) fn timed<'a>(&self, scan: &'a Scan) -> Cow<'a, Scan> {
-        let rotation = (self.motion_compensation)
-            .and_then(|it| it.rotation(self.period_s.unwrap_or(PERIOD_S)));
-        let mut timed = match (self.motion_compensation, rotation) {
+        let timing =
+            (self.motion_compensation).and_then(|it| it.timing(self.period_s.unwrap_or(PERIOD_S)));
+        let mut timed = match (self.motion_compensation, timing) {
             (None, _) if !scan.times_s.is_empty() => scan.clone(),
             (Some(_), Some(_)) if scan.times_s.is_empty() => scan.clone(),
             _ => return Cow::Borrowed(scan),
         };
         timed.times_s.clear();
-        if let Some(rotation) = rotation {
-            timed.times_s = rotation.point_times(&timed.points);
+        if let Some(timing) = timing {
+            timed.times_s = timing.point_times(&timed);
             timed.center_times();
         }
         Cow::Owned(timed)
@@ -218,6 +213,50 @@ impl Sensor {
         /// Horizontal field of view [deg].
         const SPINNING_DEG: f32 = 300.0;
         self.has_rows && self.horizontal_fov_deg > SPINNING_DEG
+    }
+
+    /// The times of the points of some scans that have none, by a comparison of consecutive ones, or by their order
+    /// where they are as measured; `None` if they fit best as they are, or if nothing shows it.
+    pub(super) fn timing(
+        &self,
+        scans: &[Scan],
+        compare: impl FnOnce() -> Result<Option<TimingComparison>, SensorError>,
+    ) -> Result<Option<MotionCompensation>, SensorError> {
+        if !self.is_spinning() {
+            return Ok(None);
+        }
+        let scans: Vec<Scan> = scans.iter().map(valid_points).collect();
+        let are_raw = self.is_moving && raw::are_raw(&scans, &self.range_image);
+        let Some(compared) = compare()? else {
+            if are_raw {
+                tracing::warn!(
+                    "motion compensation: undecided, none; the scans look as measured, but are too few or too far apart to show the times of their points; {SET_TIMES}"
+                );
+            }
+            return Ok(None);
+        };
+        let residuals = residuals_in_words(&compared);
+        let fitting = compared.best.map(|best| compared.residuals_m[best].0);
+        let ordered = match compared.residuals_m.as_slice() {
+            [_, (order @ Some(PointTiming::Order { .. }), _)] => are_raw.then_some(*order),
+            _ => None,
+        };
+        let Some(best) = fitting.or(ordered) else {
+            if self.is_moving {
+                tracing::warn!(
+                    "motion compensation: undecided, none; distances between scans: {residuals}; {SET_TIMES}"
+                );
+            } else {
+                tracing::info!("motion compensation: none, as the sensor does not move");
+            }
+            return Ok(None);
+        };
+        tracing::info!(
+            "motion compensation: {}; distances between scans: {residuals}",
+            timing_in_words(best)
+        );
+        let interval_s = self.period_s.unwrap_or(PERIOD_S);
+        Ok(best.map(|best| MotionCompensation::of(&best, interval_s)))
     }
 
     /// Warns of each reason that drops too many of the points.
@@ -269,18 +308,7 @@ fn period_s(recording: &Recording) -> Option<f64> {
     rotation::interval_s(&numbered).filter(|_| recording.has_times)
 }
 
-/// The rotation that makes consecutive scans fit best; `None` if they fit best as they are, or if nothing shows it.
-fn fitting_rotation(compared: &TimingComparison) -> Option<MotionCompensation> {
-    let best = compared.best.map(|best| compared.residuals_m[best].0);
-    let name = best.map_or("undecided, none".to_owned(), timing_in_words);
-    tracing::info!(
-        "motion compensation: {name}; distances between scans: {}",
-        residuals_in_words(compared)
-    );
-    best.flatten().map(|best| MotionCompensation::of(&best))
-}
-
-/// Warns if another rotation than the configured one makes consecutive scans fit best.
+/// Warns if other times than the configured ones make consecutive scans fit best.
 fn warn_of_contradiction(
     recording: &Recording,
     configured: MotionCompensation,
@@ -290,10 +318,14 @@ fn warn_of_contradiction(
     let Some(compared) = timings_of_recording(recording)? else {
         return Ok(());
     };
-    let configured = configured.rotation(PERIOD_S);
-    let is_same = |found: Rotation, configured: Rotation| {
-        let apart_rad = wrap_angle(found.start_rad - configured.start_rad).abs();
-        found.direction == configured.direction && apart_rad < SAME_START_RAD
+    let configured = configured.timing(PERIOD_S);
+    let is_same = |found: PointTiming, configured: PointTiming| match (found, configured) {
+        (PointTiming::Rotation(found), PointTiming::Rotation(configured)) => {
+            let apart_rad = wrap_angle(found.start_rad - configured.start_rad).abs();
+            found.direction == configured.direction && apart_rad < SAME_START_RAD
+        }
+        (PointTiming::Order { .. }, PointTiming::Order { .. }) => true,
+        _ => false,
     };
     if let Some(best) = compared.best.map(|best| compared.residuals_m[best].0)
         && !(best.zip(configured)).is_some_and(|(best, configured)| is_same(best, configured))
@@ -308,11 +340,12 @@ fn warn_of_contradiction(
 }
 
 /// Times of points in words, as the key has them.
-fn timing_in_words(timing: Option<Rotation>) -> String {
+fn timing_in_words(timing: Option<PointTiming>) -> String {
     match timing {
         None => "compensated already".to_owned(),
+        Some(PointTiming::Order { .. }) => "order".to_owned(),
         Some(rotation) => {
-            let text = MotionCompensation::of(&rotation).to_string();
+            let text = MotionCompensation::of(&rotation, PERIOD_S).to_string();
             text.replace("counter_clockwise", "counter-clockwise")
         }
     }
@@ -326,14 +359,19 @@ fn residuals_in_words(compared: &TimingComparison) -> String {
     words.join(", ")
 }
 
-/// Compares the times of points by the distances between scans of the middle of a recording.
+/// Compares the times of points by the distances between successive scans nearest the middle of a recording.
 fn timings_of_recording(recording: &Recording) -> Result<Option<TimingComparison>, SensorError> {
     let frames = &recording.frames;
-    let first = frames.len().saturating_sub(TIMING_SCANS) / 2;
-    let run = &frames[first..(first + TIMING_SCANS).min(frames.len())];
-    if !are_dense(&run.iter().map(|frame| frame.time_s).collect::<Vec<_>>()) {
+    let middle = frames.len().saturating_sub(TIMING_SCANS) / 2;
+    let is_dense =
+        |run: &&[Frame]| are_dense(&run.iter().map(|frame| frame.time_s).collect::<Vec<_>>());
+    let runs = frames
+        .windows(TIMING_SCANS.clamp(1, frames.len().max(1)))
+        .enumerate();
+    let dense = runs.filter(|(_, run)| is_dense(run));
+    let Some((_, run)) = dense.min_by_key(|(first, _)| first.abs_diff(middle)) else {
         return Ok(None);
-    }
+    };
     let scans: Vec<Scan> = run.iter().map(Frame::read).collect::<Result<_, _>>()?;
     timings_of(&scans, period_s(recording).unwrap_or(PERIOD_S))
 }

@@ -23,6 +23,7 @@ pub(crate) mod mounting;
 mod named;
 pub(crate) mod own_car;
 pub(crate) mod projection;
+mod raw;
 pub(crate) mod rotation;
 mod units;
 

@@ -9,7 +9,8 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
-use crate::lidar::Scan;
+use crate::lidar::{PointTiming, Scan};
+use crate::odometry::TimingComparison;
 
 fn infer(scans: &[Scan]) -> Sensor {
     Sensor::infer(scans, &SensorConfig::default()).unwrap()
@@ -444,4 +445,98 @@ fn a_scan_with_more_beams_than_most_does_not_count() {
         (found.beam_source, found.beams),
         (BeamSource::Order, Some(20))
     );
+}
+
+/// The points of a scan, compensated for a motion in the sweep [m].
+fn compensated(scan: &Scan, motion_m: f32) -> Scan {
+    let later = |point: &Vec3| *point + motion_m * point.y.atan2(point.x) / TAU * Vec3::X;
+    Scan {
+        points: scan.points.iter().map(later).collect(),
+        ..scan.clone()
+    }
+}
+
+#[test]
+fn the_elevations_of_scans_as_measured_are_exact_and_those_of_compensated_ones_are_not() {
+    let mut rng = ChaCha8Rng::seed_from_u64(14);
+    for offset_m in [0.0, 0.1] {
+        let sensor = Spinner {
+            offset_m,
+            ..Spinner::draw(&mut rng, 24)
+        };
+        let mut scan = sensor.scan(0.0, &mut rng);
+        scan.times_s.clear();
+        for point in &mut scan.points {
+            *point = (1000.0 * *point).round() / 1000.0;
+        }
+        let rows = infer(std::slice::from_ref(&scan)).range_image;
+        for has_rings in [true, false] {
+            scan.rings = if has_rings {
+                (0..scan.len()).map(|point| (point % 24) as u16).collect()
+            } else {
+                vec![]
+            };
+            let are_raw = |scans: &[Scan]| raw::are_raw(scans, &rows);
+            assert!(are_raw(std::slice::from_ref(&scan)));
+            assert!(!are_raw(&[compensated(&scan, 0.1)]));
+            // Of a sensor that does not always move.
+            assert!(!are_raw(&[scan.clone(), compensated(&scan, 0.1)]));
+        }
+    }
+    assert!(!raw::are_raw(&[], &LidarModel::default()));
+}
+
+#[test]
+fn the_order_of_points_decides_where_scans_as_measured_fit_no_other_times_better() {
+    let mut rng = ChaCha8Rng::seed_from_u64(15);
+    let mut scan = Spinner::draw(&mut rng, 24).scan(0.0, &mut rng);
+    scan.times_s.clear();
+    let moving = Sensor {
+        is_moving: true,
+        ..infer(std::slice::from_ref(&scan))
+    };
+    let order = Some(PointTiming::Order { period_s: 0.1 });
+    let timing = |sensor: &Sensor, scan: &Scan, best: Option<usize>| {
+        let compared = TimingComparison {
+            residuals_m: vec![(None, 0.03), (order, 0.0301)],
+            best,
+        };
+        let scans = std::slice::from_ref(scan);
+        sensor.timing(scans, || Ok(Some(compared))).unwrap()
+    };
+    let in_order = Some(MotionCompensation::Order { sweep_deg: 360.0 });
+    let bent = compensated(&scan, 0.3);
+    assert_eq!(timing(&moving, &scan, None), in_order);
+    assert_eq!(timing(&moving, &bent, None), None);
+    assert_eq!(timing(&moving, &bent, Some(1)), in_order);
+    // Simulated scans of a moment have exact elevations, too.
+    assert_eq!(timing(&moving, &scan, Some(0)), None);
+    let at_rest = Sensor {
+        is_moving: false,
+        ..moving.clone()
+    };
+    assert_eq!(timing(&at_rest, &scan, None), None);
+    let too_few = moving.timing(std::slice::from_ref(&scan), || Ok(None));
+    assert_eq!(too_few.unwrap(), None);
+}
+
+#[test]
+fn times_from_the_order_are_a_key() {
+    let read = |text: &str| MotionCompensation::try_from(text.to_owned());
+    for (text, sweep_deg) in [("order", 360.0), ("order over 400.7", 400.7)] {
+        let key = MotionCompensation::Order { sweep_deg };
+        assert_eq!(read(text), Ok(key));
+        assert_eq!(key.to_string(), text);
+        let timing = key.timing(0.1).unwrap();
+        assert_eq!(MotionCompensation::of(&timing, 0.1), key);
+    }
+    for text in [
+        "order over",
+        "order over 0",
+        "order over NaN",
+        "order from 90",
+        "orders",
+    ] {
+        assert!(read(text).unwrap_err().contains("order"), "{text}");
+    }
 }

@@ -132,7 +132,7 @@ fn inputs(search: &PoseSearch, localized_by: &str) -> Result<String> {
         let given = frame.map_from_lidar.filter(|_| search.is_given());
         parts.push(format!(
             "{source} {bytes} {} {:?} {} {} {given:?}",
-            frame.time_s, frame.rotation, frame.is_timed, frame.elevation_bias_rad
+            frame.time_s, frame.timing, frame.is_timed, frame.elevation_bias_rad
         ));
     }
     Ok(hash_of_texts(&parts))
