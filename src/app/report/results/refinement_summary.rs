@@ -19,7 +19,7 @@ pub struct RefinementSummary {
     pub refined: usize,
     /// Number of frames that were not placed in the map, and are not in the trajectory.
     pub refused: usize,
-    /// Distance of the refined pose from the estimate, where both are trusted [m].
+    /// Distance of the refined pose of a frame that was refined from its estimate, where both are trusted [m].
     pub moved_m: Option<Summary>,
     /// Turn between them [rad].
     pub turned_rad: Option<Summary>,
@@ -35,10 +35,15 @@ impl RefinementSummary {
         let trajectory = RunSummary::of_refined(results)?;
         let refined = results.refined.as_deref()?;
         let (before, after) = (results.trusted(), results.refined_trusted());
-        let moves = planar_errors(refined, &results.trajectory(estimates)).into_iter();
-        let moves = moves.zip(before.iter().zip(&after));
-        let moves = moves.filter(|(_, (before, after))| **before && **after);
-        let moves: Vec<PlanarError> = moves.map(|(it, _)| it).collect();
+        let costs_m = results.refinement_costs_m.as_deref().unwrap_or_default();
+        // Frames without a cost were only smoothed.
+        let is_refined = |row: usize| costs_m.get(row).is_some_and(|it| it[0] >= 0.0);
+        let moves: Vec<PlanarError> = (planar_errors(refined, &results.trajectory(estimates))
+            .into_iter())
+        .enumerate()
+        .filter(|&(row, _)| before[row] && after[row] && is_refined(row))
+        .map(|(_, it)| it)
+        .collect();
         let known = |column: &Option<Vec<[f64; 2]>>| -> Vec<[f64; 2]> {
             let rows = column.iter().flatten().zip(&after);
             rows.filter(|(pair, trusted)| **trusted && pair.iter().all(|&it| it >= 0.0))
@@ -75,8 +80,12 @@ impl RefinementSummary {
             0 => String::new(),
             count => format!("; {count} refused, which could not be placed in the map"),
         };
+        let shortfall = match self.trajectory.localized() {
+            Some(false) => " Less than half of the frames are tracked or registered in the map.",
+            Some(true) | None => "",
+        };
         format!(
-            "Refined {} of {} frames{}{refused}.",
+            "Refined {} of {} frames{}{refused}.{shortfall}",
             self.refined,
             self.trajectory.frames,
             moved.unwrap_or_default()
@@ -107,5 +116,42 @@ impl RefinementSummary {
         let of_both = before.into_iter().zip(after);
         let of_both = of_both.map(|(before, after)| (before, Some(after.value)));
         of_refined.chain(of_both).collect()
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a failing test may panic")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_that_were_only_smoothed_do_not_count_as_moved() {
+        let at = |x: f64| Pose2::translation(x, 0.0);
+        let estimates: Vec<Pose2> = (0..4).map(|row| at(f64::from(row))).collect();
+        let mut refined = estimates.clone();
+        refined[0] = at(7.0);
+        refined[2] = at(2.25);
+        let mut results = LocalizationResults {
+            frames: (0..4).collect(),
+            refined: Some(refined),
+            refined_states: Some(vec![1; 4]),
+            states: Some(vec![1; 4]),
+            refinement_costs_m: Some(vec![[-1.0; 2], [0.2, 0.1], [0.2, 0.1], [-1.0; 2]]),
+            ..LocalizationResults::default()
+        };
+        let summary = RefinementSummary::of(&results, &estimates).unwrap();
+        let moved_m = summary.moved_m.as_ref().unwrap();
+        // One of the two refined ones by 0.25 m, the other not at all.
+        assert_eq!(
+            (summary.refined, moved_m.mean, moved_m.max),
+            (2, 0.125, 0.25)
+        );
+        assert!(!summary.verdict().contains("Less than half"));
+
+        results.refined_states = Some(vec![1, 0, 0, 0]);
+        let summary = RefinementSummary::of(&results, &estimates).unwrap();
+        assert_eq!((summary.refused, summary.moved_m.is_none()), (3, true));
+        let verdict = summary.verdict();
+        assert!(verdict.contains("Less than half"), "{verdict}");
     }
 }
