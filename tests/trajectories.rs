@@ -257,6 +257,13 @@ fn times_and_numbers_that_do_not_fit_are_errors_with_counts_and_ranges() {
     fs::write(folder.path("short.txt"), row.repeat(150)).unwrap();
     let call = folder.evaluate("some.txt", "short.txt");
     call.fails_with(&["short.txt has 150 poses", "reaches frame 199"]);
+    fs::write(folder.path("long.txt"), row.repeat(201)).unwrap();
+    let call = folder.evaluate("some.txt", "long.txt");
+    call.fails_with(&[
+        "some.txt has 200 poses with times",
+        "long.txt has 201 without",
+        "give both times",
+    ]);
     let output = folder.evaluate("short.txt", "truth.txt").succeeds();
     assert!(
         output.stderr.contains("matched by number"),
