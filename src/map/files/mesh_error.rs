@@ -83,7 +83,7 @@ pub enum MeshFileProblem {
     )]
     TooFar { vertex: usize, position: DVec3 },
     #[error(
-        "has coordinates up to {farthest_m:.0} m in single precision, which resolves only {resolution_cm:.0} cm there; subtract an offset before exporting, or export a PLY of doubles or an OBJ"
+        "has coordinates up to {farthest_m:.0} m in single precision, which resolves only {resolution_cm:.0} cm there; scale it to metres if its unit is another one, subtract an offset before exporting, or export a PLY of doubles or an OBJ"
     )]
     TooCoarse { farthest_m: f64, resolution_cm: f64 },
 }
