@@ -7,7 +7,7 @@ use super::pose_report::{PoseReport, Tilt};
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
 use crate::odometry::{GivenPoses, OdometryConfig, PoseCheck, PoseFit, check_poses};
-use crate::recording::{Frame, Recording};
+use crate::recording::{Frame, PoseTrack, Recording};
 use crate::sensor::mounting;
 
 /// Number of scans whose motion is compared.
@@ -16,12 +16,25 @@ const SCANS: usize = 11;
 impl PoseReport {
     /// Checks the poses of a recording whose scans are not yet deskewed by them.
     pub(crate) fn new(recording: &Recording) -> Result<Self, MappingError> {
-        let known = known_poses(recording);
+        let track = recording.track.as_ref();
+        Ok(Self {
+            tilt: tilt(recording)?,
+            ..Self::of_motion(recording, track)?
+        })
+    }
+
+    /// Checks the motion of a track, such as that of an odometry, against the scans of a recording; without a track that of
+    /// its poses. The ground is not compared.
+    pub(crate) fn of_motion(
+        recording: &Recording,
+        track: Option<&PoseTrack>,
+    ) -> Result<Self, MappingError> {
+        let known = known_poses(recording, track);
         let mut runs = vec![moving_run(&known), turning_run(&known)];
         runs.dedup_by_key(|run| run.as_ptr());
         let mut checked = Vec::new();
         for run in runs {
-            checked.push((run, check_motion(recording, run)?));
+            checked.push((run, check_motion(track, run)?));
         }
         let fit = |motion: &Option<PoseCheck>| motion.as_ref().map(|it| it.fit);
         let worst = checked
@@ -33,7 +46,7 @@ impl PoseReport {
         Ok(Self {
             frames: ends.map(|end| end.map_or(0, |(frame, _)| frame.number)),
             motion,
-            tilt: tilt(recording)?,
+            tilt: None,
         })
     }
 
@@ -47,10 +60,12 @@ impl PoseReport {
 }
 
 fn check_motion(
-    recording: &Recording,
+    track: Option<&PoseTrack>,
     run: &[(&Frame, Pose3)],
 ) -> Result<Option<PoseCheck>, MappingError> {
-    let (world_from_map, calibration) = recording.world();
+    let identity = (Pose3::identity(), Pose3::identity());
+    let of_track = |it: &PoseTrack| (it.world_from_map, it.calibration.cam0_from_lidar);
+    let (world_from_map, body_from_lidar) = track.map_or(identity, of_track);
     let scans: Vec<Scan> = (run.iter())
         .map(|(frame, _)| frame.read())
         .collect::<Result<_, _>>()?;
@@ -58,17 +73,17 @@ fn check_motion(
     let given = GivenPoses {
         map_from_lidar: &poses,
         world_from_map,
-        body_from_lidar: calibration.cam0_from_lidar,
+        body_from_lidar,
     };
     let checked = check_poses(&scans, &given, &OdometryConfig::default())?;
     Ok(checked.filter(|_| run.len() > 1))
 }
 
-/// The frames that have poses, in order.
-fn known_poses(recording: &Recording) -> Vec<(&Frame, Pose3)> {
+/// The frames that have poses, in order: those of a track, or else their own.
+fn known_poses<'a>(recording: &'a Recording, track: Option<&PoseTrack>) -> Vec<(&'a Frame, Pose3)> {
     let mut frames: Vec<&Frame> = recording.frames.iter().chain(&recording.skipped).collect();
     frames.sort_by_key(|frame| frame.number);
-    let pose_of = |frame: &Frame| match &recording.track {
+    let pose_of = |frame: &Frame| match track {
         Some(track) => track.pose_at(frame, recording.has_times),
         None => frame.map_from_lidar,
     };

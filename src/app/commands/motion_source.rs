@@ -11,6 +11,8 @@ use super::stages::RecordingInputs;
 use crate::app::settings::{MotionSourceConfig, OdometrySource};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 use crate::localization::odometry::{are_in_space, demonstration_noise, motions, with_noise};
+use crate::mapping::PoseReport;
+use crate::odometry::PoseFit;
 use crate::recording::layout::Layout;
 use crate::recording::{Frame, PoseTrack, Recording};
 
@@ -82,7 +84,16 @@ impl MotionSource {
         Self::Scans(skipped.unwrap_or_default().into())
     }
 
+    /// The motion of a track, or that of the scans where they show another one.
     fn of_track(track: &PoseTrack, recording: &Recording) -> Result<Self> {
+        let report = PoseReport::of_motion(recording, Some(track))?;
+        if report.fit() != PoseFit::Fits {
+            tracing::warn!(
+                "the motion of {} is left out, and that of the scans used, because they contradict each other: {report}; correct the file, or leave it out",
+                track.path.display()
+            );
+            return Ok(Self::of_scans(recording));
+        }
         let mut last = Pose3::identity();
         let poses = track.matched(&recording.frames, recording.has_times)?;
         let known = poses.into_iter().map(|pose| {
