@@ -385,10 +385,16 @@ fn scans_that_start_elsewhere_each_time_are_compensated_by_the_order_of_their_po
         assert!(output.stderr.contains(part), "{}", output.stderr);
     }
     let report = localize_odd_frames(folder, &data, &[]);
-    assert_eq!(report["summary"]["tracking"], 30);
-    // 0.90 without times of the points.
-    let agreement = report["summary"]["agreement"]["median"].as_f64().unwrap();
-    assert!(agreement > 0.92, "{agreement}");
+    // A frame that is not sure yet is filled back.
+    let summary = &report["summary"];
+    let count = |key: &str| summary[key].as_u64().unwrap_or_default();
+    assert!(
+        count("tracking") >= 29 && count("tracking") + count("filled") == 30,
+        "{summary}"
+    );
+    // 0.899 without times of the points.
+    let agreement = summary["agreement"]["median"].as_f64().unwrap();
+    assert!(agreement > 0.905, "{agreement}");
 }
 
 #[test]
