@@ -374,6 +374,31 @@ fn a_sensor_of_another_kind_is_found_anywhere_at_two_scans_a_second() {
 }
 
 #[test]
+fn odometry_that_contradicts_the_scans_is_left_out_with_a_warning() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
+    let build = ["build-map", "street/drive_1", "--output", "map.ply"];
+    run(folder, &build);
+    let truth = truth(folder);
+    for (scale, is_left_out) in [(1.0, false), (1.3, true), (3.0, true), (-1.0, true)] {
+        let poses = truth.iter().map(|pose| {
+            let moved = (truth[0].inverse() * pose).translation.vector * scale;
+            truth[0] * Pose3::from_parts(moved.into(), (truth[0].inverse() * pose).rotation)
+        });
+        let poses: Vec<Pose3> = poses.collect();
+        write_rough_poses(&folder.join("wheels.txt"), &poses, [0.0; 2], 0.0);
+        let result = format!("{scale}/r.npz");
+        let call = localize(folder, "street/drive_2", &result).with("--odometry=wheels.txt");
+        let output = call.succeeds();
+        let warned = output.stderr.contains("contradict each other");
+        assert_eq!(warned, is_left_out, "{scale}: {}", output.stderr);
+        let error_m = largest_error_m(&folder.join(&result), &truth, 2);
+        assert!(error_m < 0.1, "{scale}: {error_m} m");
+    }
+}
+
+#[test]
 fn scans_that_start_elsewhere_each_time_are_compensated_by_the_order_of_their_points() {
     let Some(data) = real_recording("vlp16-raw") else {
         return;
