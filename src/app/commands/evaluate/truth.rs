@@ -149,18 +149,18 @@ fn poses_by_number(
             results.len()
         );
     }
-    let is_shorter = results.particles.is_empty() && last + 1 != poses.len();
+    let counts_differ = results.particles.is_empty() && last + 1 != poses.len();
     // Rows with times are of scans that were chosen by them, such as those that `localize` trusts.
     let chosen_by_time = results.estimates.is_none() && results.recorded_times().is_some();
     ensure!(
-        !(is_shorter && chosen_by_time),
+        !(counts_differ && chosen_by_time),
         "{} has {} poses with times, and {} has {} without, so that it is unknown which of them belong together; give both times (times.txt of the scans; TUM)",
         result_file.display(),
         results.len(),
         track.path.display(),
         poses.len()
     );
-    if is_shorter {
+    if counts_differ {
         tracing::warn!(
             "{} ends at row {last}, and the {} rows of {} are matched by number; give both times (TUM) if they do not begin at the same frame",
             result_file.display(),

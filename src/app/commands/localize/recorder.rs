@@ -40,10 +40,6 @@ pub struct Run {
 
 impl Run {
     pub fn new(opened: &Opened, claims: Claims) -> Result<Self> {
-        /// An empty column, if it will be filled. It is allocated for all frames at once: a drive does not stop to copy it.
-        fn column<T>(is_filled: bool, rows: usize) -> Option<Vec<T>> {
-            is_filled.then(|| Vec::with_capacity(rows))
-        }
         let config = &opened.config;
         let (has_truth, is_refined) = (config.given_poses.pose_file.is_some(), config.refine);
         let folder = opened.files.folder();
@@ -51,30 +47,33 @@ impl Run {
             .map(|frame| frame.number)
             .collect();
         let rows = selected.len();
+        // Columns are allocated for all frames at once: a drive does not stop to copy them.
+        let (every, refined) = (Some(rows), is_refined.then_some(rows));
+        let truth = has_truth.then_some(rows);
         let mut run = Self {
             results: LocalizationResults {
                 frames: Vec::with_capacity(rows),
                 particles: ParticleLog::new(config.tracker.localizer.num_particles, folder),
-                estimates: column(true, rows),
-                refined: column(is_refined, rows),
-                ground_truth: column(has_truth, rows),
-                estimates_in_space: column(true, rows),
-                refined_in_space: column(is_refined, rows),
-                ground_truth_in_space: column(has_truth, rows),
-                odometry: column(true, rows),
-                covariances: column(true, rows),
-                refined_covariances: column(is_refined, rows),
-                times_s: column(true, rows),
-                runtimes_s: column(true, rows),
-                refine_runtimes_s: column(is_refined, rows),
-                agreements: column(true, rows),
-                places: column(true, rows),
-                states: column(true, rows),
+                estimates: every.map(Vec::with_capacity),
+                refined: refined.map(Vec::with_capacity),
+                ground_truth: truth.map(Vec::with_capacity),
+                estimates_in_space: every.map(Vec::with_capacity),
+                refined_in_space: refined.map(Vec::with_capacity),
+                ground_truth_in_space: truth.map(Vec::with_capacity),
+                odometry: every.map(Vec::with_capacity),
+                covariances: every.map(Vec::with_capacity),
+                refined_covariances: refined.map(Vec::with_capacity),
+                times_s: every.map(Vec::with_capacity),
+                runtimes_s: every.map(Vec::with_capacity),
+                refine_runtimes_s: refined.map(Vec::with_capacity),
+                agreements: every.map(Vec::with_capacity),
+                places: every.map(Vec::with_capacity),
+                states: every.map(Vec::with_capacity),
                 trajectory_in_space: None,
                 trajectory_states: None,
-                refined_states: column(is_refined, rows),
-                refinement_costs_m: column(is_refined, rows),
-                refinement_agreements: column(is_refined, rows),
+                refined_states: refined.map(Vec::with_capacity),
+                refinement_costs_m: refined.map(Vec::with_capacity),
+                refinement_agreements: refined.map(Vec::with_capacity),
                 scan_outlines: (rows <= ScanOutline::MOST_FRAMES)
                     .then(|| RowLog::in_folder(folder)),
                 selected: Some(rows),

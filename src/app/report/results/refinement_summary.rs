@@ -19,7 +19,7 @@ pub struct RefinementSummary {
     pub refined: usize,
     /// Number of frames that were not placed in the map, and are not in the trajectory.
     pub refused: usize,
-    /// Distance of the refined pose of a frame that was refined from its estimate, where both are trusted [m].
+    /// Distance of the refined pose from the estimate, of refined frames where both are trusted [m].
     pub moved_m: Option<Summary>,
     /// Turn between them [rad].
     pub turned_rad: Option<Summary>,
@@ -35,15 +35,12 @@ impl RefinementSummary {
         let trajectory = RunSummary::of_refined(results)?;
         let refined = results.refined.as_deref()?;
         let (before, after) = (results.trusted(), results.refined_trusted());
-        let costs_m = results.refinement_costs_m.as_deref().unwrap_or_default();
-        // Frames without a cost were only smoothed.
-        let is_refined = |row: usize| costs_m.get(row).is_some_and(|it| it[0] >= 0.0);
-        let moves: Vec<PlanarError> = (planar_errors(refined, &results.trajectory(estimates))
-            .into_iter())
-        .enumerate()
-        .filter(|&(row, _)| before[row] && after[row] && is_refined(row))
-        .map(|(_, it)| it)
-        .collect();
+        let moves = planar_errors(refined, &results.trajectory(estimates));
+        let moves = moves.into_iter().enumerate();
+        let moves: Vec<PlanarError> = moves
+            .filter(|&(row, _)| before[row] && after[row] && !results.is_only_smoothed(row))
+            .map(|(_, it)| it)
+            .collect();
         let known = |column: &Option<Vec<[f64; 2]>>| -> Vec<[f64; 2]> {
             let rows = column.iter().flatten().zip(&after);
             rows.filter(|(pair, trusted)| **trusted && pair.iter().all(|&it| it >= 0.0))

@@ -22,10 +22,16 @@ impl LocalizationResults {
     pub fn refined_tracked(&self) -> Option<Vec<bool>> {
         let mut tracked = self.tracking(Some(self.refined_states.as_ref()?));
         let of_filter = self.tracking(self.states.as_ref());
-        for (row, [before_m, _]) in self.refinement_costs_m.iter().flatten().enumerate() {
-            tracked[row] &= of_filter[row] || *before_m >= 0.0;
+        for (row, tracked) in tracked.iter_mut().enumerate() {
+            *tracked &= of_filter[row] || !self.is_only_smoothed(row);
         }
         Some(tracked)
+    }
+
+    /// Whether a refinement compared no scan of a frame with the map: it has no cost.
+    pub fn is_only_smoothed(&self, row: usize) -> bool {
+        let costs_m = self.refinement_costs_m.as_ref();
+        costs_m.is_some_and(|costs_m| costs_m[row][0] < 0.0)
     }
 
     /// States of the trajectory of the filter, where any are known.
