@@ -63,9 +63,8 @@ fn check_motion(
     track: Option<&PoseTrack>,
     run: &[(&Frame, Pose3)],
 ) -> Result<Option<PoseCheck>, MappingError> {
-    let identity = (Pose3::identity(), Pose3::identity());
-    let of_track = |it: &PoseTrack| (it.world_from_map, it.calibration.cam0_from_lidar);
-    let (world_from_map, body_from_lidar) = track.map_or(identity, of_track);
+    let frames = track.map(|it| (it.world_from_map, it.calibration.cam0_from_lidar));
+    let (world_from_map, body_from_lidar) = frames.unwrap_or_default();
     let scans: Vec<Scan> = (run.iter())
         .map(|(frame, _)| frame.read())
         .collect::<Result<_, _>>()?;

@@ -89,7 +89,7 @@ impl MotionSource {
         let report = PoseReport::of_motion(recording, Some(track))?;
         if report.fit() != PoseFit::Fits {
             tracing::warn!(
-                "the motion of {} is left out, and that of the scans used, because they contradict each other: {report}; correct the file, or leave it out",
+                "the poses of {} and the scans contradict each other, so that the motion of the scans is used: {report}; correct the poses, or leave them out",
                 track.path.display()
             );
             return Ok(Self::of_scans(recording));
