@@ -47,6 +47,12 @@ impl Scan {
         self.points.is_empty()
     }
 
+    /// At most `count` of its points, and at least one, evenly spread.
+    #[must_use]
+    pub(crate) fn at_most(&self, count: usize) -> Self {
+        self.every(self.len().div_ceil(count.max(1)).max(1))
+    }
+
     /// Every n-th of its points.
     #[must_use]
     pub(crate) fn every(&self, n: usize) -> Self {

@@ -3,7 +3,6 @@
 //! `/tf` is sent only while the pose is believed; each change of the `/state` has its reason; `/numbers` has latency and dropped
 //! scans in addition. They are encoded in a thread of their own: neither a slow disk nor a large map slows the localization.
 
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
@@ -78,9 +77,7 @@ pub fn live_log(sinks: Sinks) -> (LiveLog, LiveLogWriter) {
 impl LiveLog {
     /// Sends a frame.
     pub fn frame(&mut self, frame: LiveFrame) {
-        let scan = frame
-            .scan
-            .every(frame.scan.len().div_ceil(MOST_POINTS).max(1));
+        let scan = frame.scan.at_most(MOST_POINTS);
         self.send(Known::Frame(LiveFrame { scan, ..frame }.into()));
     }
 
@@ -100,7 +97,7 @@ impl Drop for LiveLog {
     fn drop(&mut self) {
         if self.left_out > 0 {
             tracing::warn!(
-                "{} messages were left out of the log, which is slower than the scans: write it to a faster disk",
+                "{} messages were left out of log and viewers, which take them more slowly than the scans arrive: write the log to a faster disk",
                 self.left_out
             );
         }
@@ -109,7 +106,7 @@ impl Drop for LiveLog {
 
 impl LiveLogWriter {
     /// Sends the map and what is known until the localization ends. A log that fails is reported, and the drive goes on.
-    pub fn run(mut self, mesh: &Arc<TriangleMesh>, first_s: f64) {
+    pub fn run(mut self, mesh: &TriangleMesh, first_s: f64) {
         let sinks: &mut dyn MessageSink = &mut self.sinks;
         let mut send = || {
             let stamp = nanoseconds(first_s);
@@ -209,7 +206,7 @@ mod tests {
         sinks.add("a log".to_owned(), Hanging(hanging));
         let (mut log, writer) = live_log(sinks);
         thread::scope(|scope| {
-            scope.spawn(|| writer.run(&Arc::default(), 0.0));
+            scope.spawn(|| writer.run(&TriangleMesh::default(), 0.0));
             for frame in 0..1000 {
                 log.state(f64::from(frame), Reason::ScanAgrees);
             }

@@ -110,8 +110,7 @@ impl RunLog<'_> {
             motion.deskew(&mut scan);
         }
         scan.drop_not_finite();
-        let scan = scan.every(scan.len().div_ceil(self.max_points.max(1)).max(1));
-        Ok(cloud(&scan, map_from_lidar, stamp))
+        Ok(cloud(&scan.at_most(self.max_points), map_from_lidar, stamp))
     }
 }
 

@@ -20,13 +20,13 @@ const LIDAR: &str = "lidar";
 
 /// The pose of the lidar as a transform.
 pub fn transform(map_from_lidar: &Pose3, stamp: u64) -> FrameTransform {
-    let best = pose(map_from_lidar);
+    let pose = pose(map_from_lidar);
     FrameTransform {
         timestamp: timestamp(stamp),
         parent_frame_id: MAP.to_owned(),
         child_frame_id: LIDAR.to_owned(),
-        translation: best.position,
-        rotation: best.orientation,
+        translation: pose.position,
+        rotation: pose.orientation,
     }
 }
 
