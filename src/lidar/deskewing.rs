@@ -41,6 +41,16 @@ pub enum RotationDirection {
     CounterClockwise,
 }
 
+impl RotationDirection {
+    /// Sign of the change of the azimuth: 1 counter-clockwise, -1 clockwise.
+    pub(crate) fn sense(self) -> f64 {
+        match self {
+            Self::Clockwise => -1.0,
+            Self::CounterClockwise => 1.0,
+        }
+    }
+}
+
 /// Rotation of a spinning sensor.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Rotation {
@@ -55,10 +65,7 @@ pub struct Rotation {
 impl Rotation {
     /// Time of each point from its azimuth, zero in the middle of the revolution [s].
     pub(crate) fn point_times(&self, points: &[Vec3]) -> Vec<f32> {
-        let sense = match self.direction {
-            RotationDirection::Clockwise => -1.0,
-            RotationDirection::CounterClockwise => 1.0,
-        };
+        let sense = self.direction.sense() as f32;
         let (middle_rad, period_s) = (wrap_angle(self.start_rad + PI) as f32, self.period_s as f32);
         let time = |point: &Vec3| {
             let turns = sense * (point.y.atan2(point.x) - middle_rad) / TAU;

@@ -108,7 +108,8 @@ impl FiringOrder {
         (0..STEPS).all(|step| {
             let azimuth_rad = TAU * step as f64 / STEPS as f64;
             orders.iter().any(|order| {
-                let turned_rad = (order.sense() * (azimuth_rad - order.start_rad)).rem_euclid(TAU);
+                let turned_rad =
+                    (order.direction.sense() * (azimuth_rad - order.start_rad)).rem_euclid(TAU);
                 let inside_rad = MARGIN_RAD..order.span_rad - MARGIN_RAD;
                 inside_rad.contains(&turned_rad) || inside_rad.contains(&(turned_rad + TAU))
             })
@@ -117,15 +118,8 @@ impl FiringOrder {
 
     /// Angle from the start of this scan to that of another one, some scans later [rad].
     pub fn angle_to(&self, later: &Self, scans: f64) -> f64 {
-        let apart_rad = self.sense() * wrap_angle(later.start_rad - self.start_rad);
+        let apart_rad = self.direction.sense() * wrap_angle(later.start_rad - self.start_rad);
         apart_rad + TAU * ((scans * self.span_rad - apart_rad) / TAU).round()
-    }
-
-    fn sense(&self) -> f64 {
-        match self.direction {
-            RotationDirection::CounterClockwise => 1.0,
-            RotationDirection::Clockwise => -1.0,
-        }
     }
 }
 

@@ -225,10 +225,12 @@ impl Sensor {
         if !self.is_spinning() {
             return Ok(None);
         }
-        let scans: Vec<Scan> = scans.iter().map(valid_points).collect();
-        let are_raw = self.is_moving && raw::are_raw(&scans, &self.range_image);
+        let are_raw = || {
+            let scans: Vec<Scan> = scans.iter().map(valid_points).collect();
+            self.is_moving && raw::are_raw(&scans, &self.range_image)
+        };
         let Some(compared) = compare()? else {
-            if are_raw {
+            if are_raw() {
                 tracing::warn!(
                     "motion compensation: undecided, none; the scans look as measured, but are too few or too far apart to show the times of their points; {SET_TIMES}"
                 );
@@ -237,11 +239,11 @@ impl Sensor {
         };
         let residuals = residuals_in_words(&compared);
         let fitting = compared.best.map(|best| compared.residuals_m[best].0);
-        let ordered = match compared.residuals_m.as_slice() {
-            [_, (order @ Some(PointTiming::Order { .. }), _)] => are_raw.then_some(*order),
+        let ordered = || match compared.residuals_m.as_slice() {
+            [_, (order @ Some(PointTiming::Order { .. }), _)] => are_raw().then_some(*order),
             _ => None,
         };
-        let Some(best) = fitting.or(ordered) else {
+        let Some(best) = fitting.or_else(ordered) else {
             if self.is_moving {
                 tracing::warn!(
                     "motion compensation: undecided, none; distances between scans: {residuals}; {SET_TIMES}"

@@ -11,8 +11,8 @@
 //! The scans of drive 0005 of KITTI, in millimetres, have medians of 1.5 to 2.1 mm, those of an HDL-32 and a VLP-16 in
 //! single precision less than 0.01 mm; those of KITTI's odometry 01, compensated, 158 to 228 mm, and of nuScenes 45 to 95 mm.
 
-use super::beam::{angles, quantile};
-use crate::lidar::{LidarModel, Scan};
+use super::beam::quantile;
+use crate::lidar::{LidarModel, Projection, Scan};
 
 /// Largest median of the distances of points as measured from the cones of their beams: twice that of coordinates in
 /// millimetres, or that of scans compensated for a motion by 4 cm during a revolution [m].
@@ -58,25 +58,17 @@ fn cone_distance_m(scan: &Scan, rows: &LidarModel) -> Option<f32> {
     (!distances_m.is_empty()).then(|| quantile(&mut distances_m, 0.5))
 }
 
-/// Distance and height of the points of each beam, by rings or else by the nearest elevation [m].
+/// Distance and height of the points of each beam, by rings or else by the rows of their elevations [m].
 fn by_beam(scan: &Scan, rows: &LidarModel) -> Vec<Vec<[f32; 2]>> {
     let mut beams: Vec<Vec<[f32; 2]>> = vec![];
-    let mut elevations_deg: Vec<f32> = (0..rows.height)
-        .map(|row| rows.elevation_rad(row).to_degrees())
-        .collect();
-    elevations_deg.sort_by(f32::total_cmp);
+    let projection = Projection::of(rows);
     for (number, &point) in scan.points.iter().enumerate() {
-        let [elevation_deg, _] = angles(point);
         let beam = match scan.rings.get(number) {
-            Some(&ring) => usize::from(ring),
-            None => {
-                let above = elevations_deg.partition_point(|&it| it < elevation_deg);
-                let distance = |row: &usize| (elevations_deg[*row] - elevation_deg).abs();
-                let around = above.saturating_sub(1)..(above + 1).min(rows.height);
-                around
-                    .min_by(|a, b| distance(a).total_cmp(&distance(b)))
-                    .unwrap_or(0)
-            }
+            Some(&ring) => Some(usize::from(ring)),
+            None => projection.pixel_of(point).map(|pixel| pixel / rows.width),
+        };
+        let Some(beam) = beam else {
+            continue;
         };
         if beam >= beams.len() {
             beams.resize(beam + 1, vec![]);
