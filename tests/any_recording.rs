@@ -15,6 +15,7 @@ use fpmcl::recording::PoseTrack;
 use fpmcl::recording::{read_tum, write_tum};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde_json::Value;
+use tempfile::TempDir;
 
 /// A street with a bend, scanned by 32 beams that are not evenly spaced, without times.
 const SIMULATION: &str = "\
@@ -35,6 +36,16 @@ fn truth(folder: &Path) -> Vec<Pose3> {
     };
     let map = track("drive_1").world_from_map;
     track("drive_2").in_map(&map).map_from_lidar
+}
+
+/// A folder with two simulated drives and a map of the first, and the true poses of the second in it.
+fn with_first_drive_mapped() -> (TempDir, Vec<Pose3>) {
+    let folder = tempfile::tempdir().unwrap();
+    simulate_two_drives(folder.path(), SIMULATION);
+    let build = ["build-map", "street/drive_1", "--output", "map.ply"];
+    run(folder.path(), &build);
+    let truth = truth(folder.path());
+    (folder, truth)
 }
 
 /// Largest distance of the found positions from the true ones, from a row on [m].
@@ -147,12 +158,8 @@ fn write_rough_poses(path: &Path, truth: &[Pose3], shift_m: [f64; 2], turn_deg: 
 
 #[test]
 fn a_rough_trajectory_comes_to_centimetres_and_one_from_elsewhere_is_marked() {
-    let folder = tempfile::tempdir().unwrap();
+    let (folder, truth) = with_first_drive_mapped();
     let folder = folder.path();
-    simulate_two_drives(folder, SIMULATION);
-    let build = ["build-map", "street/drive_1", "--output", "map.ply"];
-    run(folder, &build);
-    let truth = truth(folder);
     let refine = |track: &str| {
         fpmcl("refine")
             .in_folder(folder)
@@ -316,15 +323,18 @@ fn poses_are_matched_by_time_and_their_absence_is_explained() {
         .fails_with(&["has no poses", "--poses"]);
 }
 
-/// Maps the even frames of a recording.
-fn map_even_frames(folder: &Path, recording: &str) -> Output {
-    fpmcl("build-map")
-        .in_folder(folder)
-        .with(recording)
+/// A folder with a map of the even frames of a real recording, that recording, and what was printed.
+fn with_even_frames_mapped(name: &str) -> Option<(TempDir, String, Output)> {
+    let recording = real_recording(name)?.display().to_string();
+    let folder = tempfile::tempdir().unwrap();
+    let output = fpmcl("build-map")
+        .in_folder(folder.path())
+        .with(&recording)
         .with("--output=map.ply")
         .set("frame_step", "2")
         .set("visualize", "False")
-        .succeeds()
+        .succeeds();
+    Some((folder, recording, output))
 }
 
 /// Localizes the odd frames of a recording, whose true poses the arguments name, and returns the report.
@@ -338,12 +348,9 @@ fn localize_odd_frames(folder: &Path, recording: &str, truth: &[String]) -> Valu
 
 #[test]
 fn a_real_drive_is_localized_without_any_key() {
-    let Some(data) = real_recording("kitti-0926-drive-0005") else {
+    let Some((folder, data, output)) = with_even_frames_mapped("kitti-0926-drive-0005") else {
         return;
     };
-    let folder = tempfile::tempdir().unwrap();
-    let (folder, data) = (folder.path(), data.display().to_string());
-    let output = map_even_frames(folder, &data);
     for part in ["64 beams", "motion compensation: clockwise"] {
         assert!(output.stderr.contains(part), "{}", output.stderr);
     }
@@ -351,7 +358,7 @@ fn a_real_drive_is_localized_without_any_key() {
         format!("--truth={data}/poses.txt"),
         format!("--calib={data}/calib.txt"),
     ];
-    let report = localize_odd_frames(folder, &data, &truth);
+    let report = localize_odd_frames(folder.path(), &data, &truth);
     let rmse = |quantity: &str| report["mcl"]["metrics"][quantity]["rmse"].as_f64().unwrap();
     assert!(rmse("position_m") < 0.012, "{} m", rmse("position_m"));
     assert!(rmse("heading_rad") < 3e-4, "{} rad", rmse("heading_rad"));
@@ -359,14 +366,11 @@ fn a_real_drive_is_localized_without_any_key() {
 
 #[test]
 fn a_sensor_of_another_kind_is_found_anywhere_at_two_scans_a_second() {
-    let Some(data) = real_recording("nuscenes-hdl32") else {
+    let Some((folder, data, _output)) = with_even_frames_mapped("nuscenes-hdl32") else {
         return;
     };
-    let folder = tempfile::tempdir().unwrap();
-    let (folder, data) = (folder.path(), data.display().to_string());
-    map_even_frames(folder, &data);
     let truth = [format!("--truth={data}/poses_tum.txt")];
-    let report = localize_odd_frames(folder, &data, &truth);
+    let report = localize_odd_frames(folder.path(), &data, &truth);
     assert_eq!(report["summary"]["tracking"], 16);
     let position = &report["mcl"]["metrics"]["position_m"];
     assert!(position["rmse"].as_f64().unwrap() < 0.05, "{position}");
@@ -375,18 +379,14 @@ fn a_sensor_of_another_kind_is_found_anywhere_at_two_scans_a_second() {
 
 #[test]
 fn odometry_that_contradicts_the_scans_is_left_out_with_a_warning() {
-    let folder = tempfile::tempdir().unwrap();
+    let (folder, truth) = with_first_drive_mapped();
     let folder = folder.path();
-    simulate_two_drives(folder, SIMULATION);
-    let build = ["build-map", "street/drive_1", "--output", "map.ply"];
-    run(folder, &build);
-    let truth = truth(folder);
     for (scale, is_left_out) in [(1.0, false), (1.3, true), (3.0, true), (-1.0, true)] {
-        let poses = truth.iter().map(|pose| {
-            let moved = (truth[0].inverse() * pose).translation.vector * scale;
-            truth[0] * Pose3::from_parts(moved.into(), (truth[0].inverse() * pose).rotation)
-        });
-        let poses: Vec<Pose3> = poses.collect();
+        let scaled = |pose: &Pose3| {
+            let moved = truth[0].inverse() * pose;
+            truth[0] * Pose3::from_parts((moved.translation.vector * scale).into(), moved.rotation)
+        };
+        let poses: Vec<Pose3> = truth.iter().map(scaled).collect();
         write_rough_poses(&folder.join("wheels.txt"), &poses, [0.0; 2], 0.0);
         let result = format!("{scale}/r.npz");
         let call = localize(folder, "street/drive_2", &result).with("--odometry=wheels.txt");
@@ -400,16 +400,13 @@ fn odometry_that_contradicts_the_scans_is_left_out_with_a_warning() {
 
 #[test]
 fn scans_that_start_elsewhere_each_time_are_compensated_by_the_order_of_their_points() {
-    let Some(data) = real_recording("vlp16-raw") else {
+    let Some((folder, data, output)) = with_even_frames_mapped("vlp16-raw") else {
         return;
     };
-    let folder = tempfile::tempdir().unwrap();
-    let (folder, data) = (folder.path(), data.display().to_string());
-    let output = map_even_frames(folder, &data);
     for part in ["16 beams", "motion compensation: order;"] {
         assert!(output.stderr.contains(part), "{}", output.stderr);
     }
-    let report = localize_odd_frames(folder, &data, &[]);
+    let report = localize_odd_frames(folder.path(), &data, &[]);
     // A frame that is not sure yet is filled back.
     let summary = &report["summary"];
     let count = |key: &str| summary[key].as_u64().unwrap_or_default();

@@ -209,6 +209,12 @@ fn messages(recording: &Recording, log: &str) -> BTreeMap<String, Vec<Vec<u8>>> 
     topics
 }
 
+/// The texts of messages, among bytes of their other fields.
+fn texts(messages: &[Vec<u8>]) -> Vec<String> {
+    let texts = messages.iter().map(|it| String::from_utf8_lossy(it));
+    texts.map(|text| text.into_owned()).collect()
+}
+
 #[test]
 fn a_log_that_is_written_on_the_way_has_the_messages_that_export_writes_of_the_result() {
     let recording = street(12);
@@ -232,13 +238,7 @@ fn a_log_that_is_written_on_the_way_has_the_messages_that_export_writes_of_the_r
     }
     assert_eq!(live["/tf"].len(), 12);
     assert_eq!(live["/scan"].len(), 12);
-    let text = |topic: &str| -> Vec<String> {
-        let texts = live[topic].iter();
-        texts
-            .map(|it| String::from_utf8_lossy(it).into_owned())
-            .collect()
-    };
-    let [starting, tracking] = text("/state").try_into().unwrap();
+    let [starting, tracking] = texts(&live["/state"]).try_into().unwrap();
     assert!(
         starting.contains("starting: no scan has arrived"),
         "{starting}"
@@ -247,7 +247,7 @@ fn a_log_that_is_written_on_the_way_has_the_messages_that_export_writes_of_the_r
         tracking.contains("tracking: the scan agrees with the map"),
         "{tracking}"
     );
-    for (frame, numbers) in text("/numbers").iter().enumerate() {
+    for (frame, numbers) in texts(&live["/numbers"]).iter().enumerate() {
         let numbers: Value = serde_json::from_str(numbers).unwrap();
         assert_eq!(numbers["frame"], frame);
         assert_eq!(numbers["reason"], "the scan agrees with the map");
@@ -256,13 +256,6 @@ fn a_log_that_is_written_on_the_way_has_the_messages_that_export_writes_of_the_r
     let again = patient(&recording).with("--record=run.mcap");
     let again = again.set("result_path", "others/localization.npz");
     again.fails_with(&["run.mcap exists; add --force"]);
-}
-
-/// The messages of a log about the states, among bytes of their fields.
-fn states(recording: &Recording, log: &str) -> Vec<String> {
-    let states = &messages(recording, log)["/state"];
-    let texts = states.iter().map(|it| String::from_utf8_lossy(it));
-    texts.map(|text| text.into_owned()).collect()
 }
 
 #[test]
@@ -276,7 +269,7 @@ fn a_sensor_that_stalls_is_reported_and_the_run_goes_on_when_it_sends_again() {
     let call = call.with("--replay=velodyne").with("--queue=100");
     let output = call.with("--record=run.mcap").with("--json").succeeds();
     assert_eq!(report(&output)["live"]["states"], json!({"tracking": 12}));
-    let states = states(&recording, "run.mcap");
+    let states = texts(&messages(&recording, "run.mcap")["/state"]);
     let mut left = states.iter();
     for expected in [
         "tracking: the scan agrees with the map",
@@ -294,7 +287,7 @@ fn after_a_jump_of_the_clock_the_car_is_found_around_its_last_pose() {
     const START_NS: u64 = 1_700_000_000_000_000_000;
 
     let recording = street(12);
-    let messages = |jump_ns: i64| -> Vec<Recorded> {
+    let recorded = |jump_ns: i64| -> Vec<Recorded> {
         let message = |frame: usize| {
             let points = recording.scan(frame);
             let numbers = points.iter().flatten();
@@ -324,7 +317,7 @@ fn after_a_jump_of_the_clock_the_car_is_found_around_its_last_pose() {
         let bag = mcap(
             ::mcap::WriteOptions::new().compression(None),
             "cdr",
-            &messages(jump_s * 1_000_000_000),
+            &recorded(jump_s * 1_000_000_000),
         );
         fs::write(recording.path(&format!("{name}.mcap")), bag).unwrap();
         let call = common::fpmcl("live").in_folder(recording.folder());
@@ -346,7 +339,7 @@ fn after_a_jump_of_the_clock_the_car_is_found_around_its_last_pose() {
             "{}",
             output.stderr
         );
-        let states = states(&recording, &log);
+        let states = texts(&messages(&recording, &log)["/state"]);
         let is_jump = |it: &String| it.contains("searching: the clock of the scans was set");
         assert_eq!(states.iter().any(is_jump), has_jumped, "{states:?}");
         assert_eq!(report["live"]["rejected"], 0, "{name} {report}");
