@@ -154,6 +154,14 @@ impl FrameMotion {
         }
     }
 
+    /// A motion that wheels or another sensor measured.
+    pub fn measured(motion: Pose3) -> Self {
+        Self {
+            increment: pose2_from_pose3(&motion),
+            in_space: are_in_space(&[motion]).then_some(motion),
+        }
+    }
+
     /// This motion, followed by another one.
     fn then(self, next: Self) -> Self {
         let in_space = self.in_space.zip(next.in_space);

@@ -3,7 +3,7 @@
 use std::iter;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::Result;
 
@@ -12,7 +12,7 @@ use super::super::localize::frame_tracker::FrameTracker;
 use super::super::localize::opened::Opened;
 use super::super::motion_source::{FrameMotion, MotionSource};
 use super::last_pose::LastPoseWriter;
-use super::replay::{ReplayedFrame, replay};
+use super::robot::{ArrivedFrame, Robot};
 use crate::app::report::export::{LiveFrame, LiveLog, Sinks, live_log};
 use crate::app::report::results::{LatencySummary, LiveSummary};
 use crate::app::report::run_output;
@@ -27,13 +27,13 @@ use crate::localization::{LocalizerError, Start, TrackerError};
 /// Longest wait for a scan before the state is looked at.
 const WAIT: Duration = Duration::from_millis(50);
 
-/// A drive through a recording at its own pace.
+/// A drive whose scans arrive at their own pace.
 pub struct Drive<'a, 'b> {
-    /// Map, recording and configuration.
+    /// Map and configuration, and the recording that is replayed.
     pub opened: &'a Opened,
     /// Takes the localized frames.
     pub recorded: Recorded<'a, 'b>,
-    /// How many times faster than it was recorded.
+    /// Seconds of the stamps per second: how many times faster than it was recorded.
     pub rate: f64,
     /// Number of scans that may wait.
     pub queue: usize,
@@ -42,27 +42,34 @@ pub struct Drive<'a, 'b> {
 }
 
 impl Drive<'_, '_> {
-    /// Receives scans in one thread and localizes them in this one, until the last or an interruption.
-    pub fn run(&self, motion: &mut MotionSource, start: Start, sinks: Sinks) -> Result<()> {
+    /// Has scans received in one thread and localizes them in this one, until the last or an interruption. `receive` fills the
+    /// inbox until it is closed, closes it at the end, and counts what it could not read.
+    pub fn run(
+        &self,
+        motion: &mut MotionSource,
+        start: Start,
+        sinks: Sinks,
+        robot: Robot<'_>,
+        receive: impl FnOnce(&Inbox<ArrivedFrame>, &AtomicU64) + Send,
+    ) -> Result<()> {
         // A known start is that of the first scan, which is not dropped.
         let is_prepared = matches!(start, Start::Pose { .. });
         let tracker = FrameTracker::new(self.opened, motion, start)?;
         let inbox = Inbox::new(self.queue);
         let unreadable = AtomicU64::new(0);
-        let interrupt = &self.context.interrupt;
-        let (frames, rate) = (&self.opened.recording.frames, self.rate);
         let mesh = (!sinks.is_empty())
             .then(|| run_output::map_around(&self.opened.map, iter::empty()))
             .transpose()?;
         let summary = thread::scope(|scope| {
-            scope.spawn(|| replay(frames, rate, &inbox, &unreadable, interrupt));
+            scope.spawn(|| receive(&inbox, &unreadable));
             let log = mesh.map(|mesh| {
                 let (log, writer) = live_log(sinks);
-                let first_s = frames.first().map_or(0.0, |frame| frame.time_s);
+                let first = self.opened.recording.frames.first();
+                let first_s = first.map_or_else(now_s, |frame| frame.time_s);
                 scope.spawn(move || writer.run(&mesh, first_s));
                 log
             });
-            let mut driver = Driver::new(self, tracker, is_prepared, log);
+            let mut driver = Driver::new(self, tracker, is_prepared, (log, robot));
             let outcome = driver.follow(&inbox);
             // Nobody takes what the other thread would still send.
             inbox.close();
@@ -72,6 +79,9 @@ impl Drive<'_, '_> {
         let mut run = (self.recorded)();
         let dropped = inbox.dropped();
         run.missed = (dropped + rejected) as usize;
+        if self.opened.is_driving() {
+            run.results.selected = Some(run.results.len() + run.missed);
+        }
         run.live = Some(LiveSummary {
             received: inbox.received(),
             dropped,
@@ -80,6 +90,12 @@ impl Drive<'_, '_> {
         });
         Ok(())
     }
+}
+
+/// Now, in seconds since 1970.
+fn now_s() -> f64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    since.map_or(0.0, |it| it.as_secs_f64())
 }
 
 /// The thread that computes.
@@ -91,6 +107,9 @@ struct Driver<'a, 'b> {
     latencies: Latencies,
     last_pose: Option<LastPoseWriter>,
     log: Option<LiveLog>,
+    robot: Robot<'a>,
+    /// Where the odometry has the sensor at the last scan that was localized, where it is measured.
+    odom_from_last: Option<Pose3>,
     summary: LiveSummary,
     /// Whether the map is prepared for the start.
     is_prepared: bool,
@@ -105,7 +124,7 @@ impl<'a, 'b> Driver<'a, 'b> {
         drive: &'a Drive<'a, 'b>,
         tracker: FrameTracker<'a>,
         is_prepared: bool,
-        log: Option<LiveLog>,
+        (log, robot): (Option<LiveLog>, Robot<'a>),
     ) -> Self {
         let config = &drive.opened.config;
         Self {
@@ -116,6 +135,8 @@ impl<'a, 'b> Driver<'a, 'b> {
             latencies: Latencies::default(),
             last_pose: LastPoseWriter::new(config),
             log,
+            robot,
+            odom_from_last: None,
             summary: LiveSummary::default(),
             is_prepared,
             last_s: 0.0,
@@ -125,12 +146,14 @@ impl<'a, 'b> Driver<'a, 'b> {
     }
 
     /// Takes scans until the last.
-    fn follow(&mut self, inbox: &Inbox<ReplayedFrame>) -> Result<()> {
+    fn follow(&mut self, inbox: &Inbox<ArrivedFrame>) -> Result<()> {
         let context = self.drive.context;
-        let task = context
-            .progress
-            .task("live", self.drive.opened.recording.frames.len());
+        let frames = self.drive.opened.recording.frames.len();
+        let task = (frames > 0).then(|| context.progress.task("live", frames));
         while !context.interrupt.requested() {
+            if let Some(start) = (self.robot.proposed)() {
+                self.propose(start)?;
+            }
             match inbox.take(WAIT) {
                 Received::End => break,
                 Received::Nothing => self.wait(),
@@ -141,7 +164,9 @@ impl<'a, 'b> Driver<'a, 'b> {
                 Received::Scan(arrival) => {
                     self.take(arrival, inbox.dropped())?;
                     let count = inbox.dropped() + self.summary.rejected + self.latencies.count();
-                    task.set_share(count as f64 / self.drive.opened.recording.frames.len() as f64);
+                    if let Some(task) = &task {
+                        task.set_share(count as f64 / frames as f64);
+                    }
                 }
             }
         }
@@ -169,12 +194,11 @@ impl<'a, 'b> Driver<'a, 'b> {
     }
 
     /// Localizes a scan.
-    fn take(&mut self, arrival: Arrival<ReplayedFrame>, dropped: u64) -> Result<()> {
+    fn take(&mut self, arrival: Arrival<ArrivedFrame>, dropped: u64) -> Result<()> {
         let Arrival {
-            scan: (row, scan),
+            scan: (frame, scan),
             arrived,
         } = arrival;
-        let frame = &self.drive.opened.recording.frames[row];
         self.period = self.last_arrival.map(|last| arrived.duration_since(last));
         (self.last_arrival, self.last_s) = (Some(arrived), frame.time_s);
         let stamp_s = scan.time_s.unwrap_or(frame.time_s);
@@ -188,13 +212,16 @@ impl<'a, 'b> Driver<'a, 'b> {
             }
             Tick::Jumped => self.restart(stamp_s)?,
         }
-        let tracked = match self.tracker.step(row, &scan) {
+        let odom_from_lidar = (self.robot.odom_from_lidar)(frame.time_s);
+        let measured = self.moved_to(odom_from_lidar).map(FrameMotion::measured);
+        let tracked = match self.tracker.step(&frame, &scan, measured) {
             Err(error) if error.downcast_ref().is_some_and(is_about_scan) => {
                 self.reject(&error.to_string());
                 return Ok(());
             }
             tracked => tracked?,
         };
+        self.odom_from_last = odom_from_lidar;
         let before = self.monitor.reason();
         self.monitor
             .update(&tracked.estimate, &in_space(tracked.motion));
@@ -204,32 +231,63 @@ impl<'a, 'b> Driver<'a, 'b> {
         if let (LiveState::Tracking, Some(last_pose)) = (state, &mut self.last_pose) {
             last_pose.update(frame.time_s, &tracked.estimate.map_from_lidar);
         }
-        (self.drive.recorded)().record(frame, &scan, &tracked)?;
         *self.summary.states.entry(state).or_default() += 1;
-        let estimate = tracked.estimate;
+        let estimate = tracked.estimate.clone();
+        let localized = LiveFrame {
+            number: frame.number,
+            time_s: frame.time_s,
+            scan,
+            estimate,
+            reason: self.monitor.reason(),
+            latency,
+            dropped,
+        };
+        (self.robot.localized)(&localized);
+        (self.drive.recorded)().record(&frame, &localized.scan, &tracked)?;
         if let Some(log) = &mut self.log {
-            log.frame(LiveFrame {
-                number: frame.number,
-                time_s: frame.time_s,
-                scan,
-                estimate,
-                reason: self.monitor.reason(),
-                latency,
-                dropped,
-            });
+            log.frame(localized);
         }
         self.note_change(before, Duration::ZERO);
         Ok(())
     }
 
+    /// The motion since the last scan that was localized, where both are measured.
+    fn moved_to(&self, odom_from_lidar: Option<Pose3>) -> Option<Pose3> {
+        Some(self.odom_from_last?.inverse() * odom_from_lidar?)
+    }
+
     /// Looks at the state while no scan arrives.
     fn wait(&mut self) {
         let (Some(last), Some(period)) = (self.last_arrival, self.period) else {
+            (self.robot.waiting)(now_s(), self.monitor.reason());
             return;
         };
         let (before, waited) = (self.monitor.reason(), last.elapsed());
-        self.monitor.wait(waited, period, None);
+        let now_s = self.last_s + self.drive.rate * waited.as_secs_f64();
+        let moved = self.moved_to((self.robot.odom_from_lidar)(now_s));
+        self.monitor.wait(waited, period, moved.as_ref());
         self.note_change(before, waited);
+        (self.robot.waiting)(now_s, self.monitor.reason());
+    }
+
+    /// Begins again at a start that was proposed, which the scans have to confirm.
+    fn propose(&mut self, start: Start) -> Result<()> {
+        let tiles = &self.drive.opened.map.tiles;
+        if let Start::Pose { map_from_lidar, .. } = &start
+            && tiles.valid_tile_of(map_from_lidar).is_none()
+        {
+            let t = map_from_lidar.translation;
+            tracing::warn!(
+                "the pose that was proposed at x {:.1} m, y {:.1} m is outside the mapped area, and is left out",
+                t.x,
+                t.y
+            );
+            return Ok(());
+        }
+        self.tracker.restart(start)?;
+        (self.odom_from_last, self.is_prepared) = (None, true);
+        self.note(Reason::PoseProposed);
+        Ok(())
     }
 
     /// Begins again after the clock of the scans was set, around the pose that was believed.
@@ -244,6 +302,7 @@ impl<'a, 'b> Driver<'a, 'b> {
             |last| Start::near(&last.map_from_lidar, opened.config.start.clone()),
         );
         self.tracker.restart(start)?;
+        self.odom_from_last = None;
         self.note(Reason::ClockJumped);
         Ok(())
     }

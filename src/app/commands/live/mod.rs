@@ -3,6 +3,7 @@
 mod driving;
 mod last_pose;
 mod replay;
+mod robot;
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
@@ -13,9 +14,13 @@ use serde::{Serialize, Serializer};
 use serde_json::json;
 
 use self::driving::Drive;
+use self::replay::replay;
+use self::robot::Robot;
 use super::export::{self, ExportArgs};
+use super::localize::opened::{Opened, open};
 use super::localize::tracking::start;
-use super::localize::{DriveArgs, run_with, start_pose};
+use super::localize::{DriveArgs, Recorded, run_with, start_pose};
+use super::motion_source::MotionSource;
 use crate::app::report::Report;
 #[cfg(feature = "viewer")]
 use crate::app::report::export::Viewer;
@@ -158,25 +163,31 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
     });
     let claimed = log.map(|log| export::check(&log, context)).transpose()?;
     let sinks = sinks(args)?;
-    let report = run_with(
-        config,
-        &[last_pose::FILE],
-        context,
-        |opened, motion, recorded| {
-            let start = last.as_ref().map_or_else(
-                || start(config, &opened.map, &opened.recording),
-                |last| Start::near(last, config.start.clone()),
-            );
-            let drive = Drive {
-                opened,
-                recorded,
-                rate: args.rate,
-                queue: usize::from(args.queue),
-                context,
-            };
-            drive.run(motion, start, sinks)
-        },
-    );
+    let opened = open(config, &[last_pose::FILE], context);
+    let localize = |opened: &Opened, motion: &mut MotionSource, recorded: Recorded<'_, '_>| {
+        let start = last.as_ref().map_or_else(
+            || start(config, &opened.map, &opened.recording),
+            |last| Start::near(last, config.start.clone()),
+        );
+        let drive = Drive {
+            opened,
+            recorded,
+            rate: args.rate,
+            queue: usize::from(args.queue),
+            context,
+        };
+        let (frames, interrupt) = (&opened.recording.frames, &context.interrupt);
+        drive.run(
+            motion,
+            start,
+            sinks,
+            Robot::default(),
+            |inbox, unreadable| {
+                replay(frames, args.rate, inbox, unreadable, interrupt);
+            },
+        )
+    };
+    let report = opened.and_then(|opened| run_with(opened, context, localize));
     for (mut claims, path) in claimed.into_iter().flatten() {
         if path.exists() {
             claims.finish(&path)?;

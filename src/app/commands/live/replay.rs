@@ -4,8 +4,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use super::robot::ArrivedFrame;
 use crate::app::run::Interrupt;
-use crate::lidar::Scan;
 use crate::live::Inbox;
 use crate::recording::Frame;
 
@@ -15,21 +15,18 @@ const POLL: Duration = Duration::from_millis(20);
 /// Time between two looks at whether the first scan is taken.
 const TAKEN: Duration = Duration::from_millis(1);
 
-/// A frame that arrived: its row in the recording, and its scan.
-pub type ReplayedFrame = (usize, Scan);
-
 /// Puts the scans of frames into an inbox at the pace of their times, which begins when the first is taken: a known start is
 /// that of this scan. Counts those that cannot be read. A scan is read before its time.
 pub fn replay(
     frames: &[Frame],
     rate: f64,
-    inbox: &Inbox<ReplayedFrame>,
+    inbox: &Inbox<ArrivedFrame>,
     unreadable: &AtomicU64,
     interrupt: &Interrupt,
 ) {
     let ends = || interrupt.requested() || inbox.is_closed();
     let mut began: Option<(Instant, f64)> = None;
-    for (row, frame) in frames.iter().enumerate() {
+    for frame in frames {
         let scan = match frame.read() {
             Ok(scan) => scan,
             Err(error) => {
@@ -50,7 +47,7 @@ pub fn replay(
         if ends() {
             break;
         }
-        inbox.push((row, scan));
+        inbox.push((frame.clone(), scan));
         if began.is_none() {
             while !ends() && !inbox.is_empty() {
                 thread::sleep(TAKEN);

@@ -12,16 +12,19 @@ use crate::recording::Frame;
 use crate::refinement::{InitialEstimate, TrajectoryRefiner};
 
 /// Rows and poses in space of the frames that can be placed in the map, of those up to the first tracked one; `None` without
-/// odometry. `frames` begin with these frames.
+/// odometry, and where no scan can be read again. `frames` begin with these frames.
 pub fn fill_back(
     opened: &Opened,
     frames: &[Frame],
     searched: &LocalizationResults,
     context: &Context,
 ) -> Result<Option<Vec<(usize, Pose3)>>> {
-    let (Some(states), Some(estimates), Some(odometry)) =
-        (&searched.states, &searched.estimates, &searched.odometry)
-    else {
+    let (Some(states), Some(estimates), Some(odometry), Some(sensor)) = (
+        &searched.states,
+        &searched.estimates,
+        &searched.odometry,
+        &opened.sensor,
+    ) else {
         return Ok(None);
     };
     let config = &opened.config;
@@ -39,7 +42,7 @@ pub fn fill_back(
         searched.times_s.as_deref(),
     );
     let seed = config.tracker.seed;
-    let mut refiner = TrajectoryRefiner::new(&opened.map, &opened.sensor, config.refiner(), seed)?;
+    let mut refiner = TrajectoryRefiner::new(&opened.map, sensor, config.refiner(), seed)?;
     for (frame, start) in frames.iter().zip(&starts) {
         refiner.add(&frame.read()?, start)?;
     }

@@ -10,6 +10,7 @@ use crate::app::settings::MotionModel;
 use crate::lidar::Scan;
 use crate::localization::motion::VelocityCommand;
 use crate::localization::{Estimate, Odometry, Start, Tracker, TrackerConfig, TrackerError};
+use crate::recording::Frame;
 use crate::refinement::{FrameResult, InitialEstimate, TrajectoryRefiner};
 
 /// A frame that was localized.
@@ -24,14 +25,14 @@ pub struct TrackedFrame<'a> {
     pub runtimes: [Duration; 2],
 }
 
-/// Localizes frames of a recording one after the other; frames may be left out.
+/// Localizes frames one after the other; frames may be left out.
 pub struct FrameTracker<'a> {
     opened: &'a Opened,
     motion: &'a mut MotionSource,
     tracker: Tracker,
     refiner: Option<TrajectoryRefiner>,
-    /// Row of the last frame.
-    last: Option<usize>,
+    /// Row of the last frame in the recording, and its time [s].
+    last: Option<(usize, f64)>,
 }
 
 impl<'a> FrameTracker<'a> {
@@ -48,13 +49,18 @@ impl<'a> FrameTracker<'a> {
                 .filter(|_| matches!(motion, MotionSource::Scans(_))),
             ..config.tracker.clone()
         };
-        let tracker = Tracker::new(map, tracker)?.with_sensor(sensor.clone());
-        let refiner = || TrajectoryRefiner::new(map, sensor, config.refiner(), config.tracker.seed);
+        let mut tracker = Tracker::new(map, tracker)?;
+        if let Some(sensor) = sensor {
+            tracker = tracker.with_sensor(sensor.clone());
+        }
+        let sensor = sensor.as_ref().filter(|_| config.refine);
+        let seed = config.tracker.seed;
+        let refiner = sensor.map(|it| TrajectoryRefiner::new(map, it, config.refiner(), seed));
         Ok(Self {
             opened,
             motion,
             tracker: tracker.with_start(start),
-            refiner: config.refine.then(refiner).transpose()?,
+            refiner: refiner.transpose()?,
             last: None,
         })
     }
@@ -69,22 +75,34 @@ impl<'a> FrameTracker<'a> {
         self.tracker.restart(start)
     }
 
-    /// Localizes the frame of a row, later than those before.
-    pub fn step(&mut self, row: usize, scan: &Scan) -> Result<TrackedFrame<'_>> {
-        let recording = &self.opened.recording;
+    /// Localizes a frame, later than those before; `measured` is the motion since the last one that was localized, where the
+    /// robot measures it.
+    pub fn step(
+        &mut self,
+        frame: &Frame,
+        scan: &Scan,
+        measured: Option<FrameMotion>,
+    ) -> Result<TrackedFrame<'_>> {
+        let frames = &self.opened.recording.frames;
         let started = Instant::now();
-        for between in self.motion.frames_before(&recording.frames[row]) {
+        for between in self.motion.frames_before(frame) {
             self.tracker.pass(&between.read()?)?;
         }
-        let since = self.last.map_or(row, |last| last + 1);
-        let motion = match self.tracker.measure(scan)? {
-            Odometry::Motion(motion) => Some(FrameMotion::from_motion(motion)),
+        let row = frames.partition_point(|it| it.number < frame.number);
+        let (since, before_s) = match self.last {
+            Some((last, time_s)) => (last + 1, time_s),
+            None => (row, frame.time_s),
+        };
+        let of_scans = self.tracker.measure(scan)?;
+        let motion = match (measured, of_scans) {
+            (Some(measured), _) => Some(measured),
+            (None, Odometry::Motion(motion)) => Some(FrameMotion::from_motion(motion)),
             _ => self.motion.given_over(since..row + 1),
         };
-        let times_s = [since.saturating_sub(1), row].map(|row| recording.frames[row].time_s);
+        let times_s = [before_s, frame.time_s];
         let odometry = odometry_into(self.opened.config.motion_model, motion, times_s);
         let estimate = self.tracker.step_with_motion(scan, odometry)?;
-        self.last = Some(row);
+        self.last = Some((row, frame.time_s));
         let runtime = started.elapsed();
         let refined = match &mut self.refiner {
             Some(refiner) => Some(refiner.add(scan, &InitialEstimate::from(&estimate))?),

@@ -22,7 +22,7 @@ use self::written::{write_results, write_run, write_trajectories};
 use super::motion_source::MotionSource;
 use crate::app::report::Report;
 use crate::app::run::arguments::numbers;
-use crate::app::run::{Context, RunArgs};
+use crate::app::run::{Claims, Context, RunArgs};
 use crate::app::settings::LocalizationConfig;
 
 /// Files beside the scans and the map, of `localize` and `live`.
@@ -85,7 +85,8 @@ pub fn start_pose(text: &str) -> Result<[f64; 3], &'static str> {
 
 /// Localizes the selected frames of a recording.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
-    run_with(config, &[], context, |opened, motion, recorded| {
+    let opened = opened::open(config, &[], context)?;
+    run_with(opened, context, |opened, motion, recorded| {
         localize(opened, motion, recorded, context)
     })
 }
@@ -93,15 +94,12 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
 /// Access to the localized frames.
 pub type Recorded<'a, 'b> = &'a dyn Fn() -> MutexGuard<'b, Run>;
 
-/// Opens a recording in a map, has its frames localized and recorded, and writes the result; further files are written
-/// next to it.
+/// Has frames localized and recorded, and writes the result.
 pub fn run_with(
-    config: &LocalizationConfig,
-    further_files: &[&'static str],
+    (opened, mut motion, claims): (Opened, MotionSource, Claims),
     context: &Context,
     localize: impl FnOnce(&Opened, &mut MotionSource, Recorded<'_, '_>) -> Result<()>,
 ) -> Result<Report> {
-    let (opened, mut motion, claims) = opened::open(config, further_files, context)?;
     let run = Mutex::new(Run::new(&opened, claims)?);
     let recorded = || run.lock().unwrap_or_else(PoisonError::into_inner);
     context.interrupt.supervise(
@@ -109,7 +107,7 @@ pub fn run_with(
             localize(&opened, &mut motion, &recorded)?;
             let searched = {
                 let run = recorded();
-                (run.searched()).map(|searched| (searched, run.frames(&opened.recording)))
+                (run.searched()).map(|searched| (searched, run.frames(&opened)))
             };
             let filled = searched
                 .map(|(searched, frames)| fill_back(&opened, &frames, &searched, context))

@@ -1,5 +1,7 @@
 //! The inputs of a localization, opened, and its outputs, claimed.
 
+use std::path::Path;
+
 use anyhow::Result;
 
 use super::super::motion_source::MotionSource;
@@ -24,10 +26,17 @@ pub struct Opened {
     pub files: RunFiles,
     /// The map.
     pub map: Map,
-    /// The recording, with its true poses where they are given.
+    /// The recording, with its true poses where they are given; without frames where a robot sends them.
     pub recording: Recording,
-    /// The sensor.
-    pub sensor: Sensor,
+    /// The sensor; `None` where it is inferred from the scans as they arrive.
+    pub sensor: Option<Sensor>,
+}
+
+impl Opened {
+    /// Whether the scans are those of a robot that drives: nobody knows how many there will be, or reads one again.
+    pub fn is_driving(&self) -> bool {
+        self.recording.frames.is_empty()
+    }
 }
 
 /// Opens map, recording and source of motion, after the outputs are claimed, with further files next to the result.
@@ -39,7 +48,8 @@ pub fn open(
     let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
     let files = RunFiles::new(&config.result_path);
     context.interrupt.keeps("no frame was finished");
-    let claims = prepare(config, inputs, further_files, context, &files)?;
+    let read = input_files(inputs, &config.map_input, &config.motion, context)?;
+    let claims = prepare(config, read, further_files, &files)?;
     let map = config.map_input.load(config.map_options(), context)?;
     let mut resolved = config.clone();
     let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
@@ -52,20 +62,18 @@ pub fn open(
         files,
         map,
         recording,
-        sensor,
+        sensor: Some(sensor),
     };
     Ok((opened, motion, claims))
 }
 
-/// Prepares the configured outputs.
+/// Prepares the configured outputs of files that are read.
 fn prepare(
     config: &LocalizationConfig,
-    inputs: RecordingInputs,
+    inputs: Vec<(&'static str, &Path)>,
     further_files: &[&'static str],
-    context: &Context,
     files: &RunFiles,
 ) -> Result<Claims> {
-    let inputs = input_files(inputs, &config.map_input, &config.motion, context)?;
     let mut names = Vec::new();
     if config.save_result {
         names.extend(REPORT_FILES.iter().chain(&LOCALIZATION_FILES));

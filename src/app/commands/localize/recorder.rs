@@ -1,6 +1,7 @@
 //! Results of localize, collected frame by frame.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use anyhow::Result;
 
@@ -14,7 +15,7 @@ use crate::app::run::{Claims, Interrupted};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
 use crate::localization::State;
-use crate::recording::{Frame, Recording};
+use crate::recording::{Frame, ScanSource};
 
 /// The localized frames.
 pub struct Run {
@@ -47,7 +48,7 @@ impl Run {
             .map(|frame| frame.number)
             .collect();
         let rows = selected.len();
-        // Columns are allocated for all frames at once: a drive does not stop to copy them.
+        // Columns are allocated for all frames at once where their number is known: a replay does not stop to copy them.
         let (every, refined) = (Some(rows), is_refined.then_some(rows));
         let truth = has_truth.then_some(rows);
         let mut run = Self {
@@ -76,7 +77,7 @@ impl Run {
                 refinement_agreements: refined.map(Vec::with_capacity),
                 scan_outlines: (rows <= ScanOutline::MOST_FRAMES)
                     .then(|| RowLog::in_folder(folder)),
-                selected: Some(rows),
+                selected: (!opened.is_driving()).then_some(rows),
                 times_are_assumed: !opened.recording.has_times,
             },
             writer: None,
@@ -176,6 +177,9 @@ impl Run {
         push(&mut results.refinement_costs_m, costs_m);
         push(&mut results.refinement_agreements, agreements);
         push(&mut results.refine_runtimes_s, refine_runtime.as_secs_f64());
+        if results.len() > ScanOutline::MOST_FRAMES {
+            results.scan_outlines = None;
+        }
         if let Some(writer) = &mut self.writer {
             if particles.len() > writer.capacity() {
                 self.begin_result()?;
@@ -190,20 +194,33 @@ impl Run {
     }
 
     /// The localized frames.
-    pub fn frames(&self, recording: &Recording) -> Vec<Frame> {
+    pub fn frames(&self, opened: &Opened) -> Vec<Frame> {
+        if opened.is_driving() {
+            let forgotten = Arc::<Scan>::default();
+            let frame = |(&number, &time_s)| {
+                Frame::new(number, ScanSource::Memory(forgotten.clone()), time_s)
+            };
+            let times_s = self.results.times_s.iter().flatten();
+            return self.results.frames.iter().zip(times_s).map(frame).collect();
+        }
         let is_localized =
             |frame: &&Frame| self.results.frames.binary_search(&frame.number).is_ok();
-        recording
-            .frames
-            .iter()
-            .filter(is_localized)
-            .cloned()
-            .collect()
+        let frames = opened.recording.frames.iter();
+        frames.filter(is_localized).cloned().collect()
+    }
+
+    /// Number of frames to localize; of a robot, those that arrived.
+    fn expected(&self, opened: &Opened) -> usize {
+        if opened.is_driving() {
+            self.results.len() + self.missed
+        } else {
+            opened.recording.frames.len()
+        }
     }
 
     /// Whether no frame is left.
-    pub fn is_complete(&self, recording: &Recording) -> bool {
-        self.results.len() + self.missed == recording.frames.len()
+    pub fn is_complete(&self, opened: &Opened) -> bool {
+        self.results.len() + self.missed == self.expected(opened)
     }
 
     /// The frames up to the first tracked one, if there are any before it.
@@ -259,7 +276,7 @@ impl Run {
 impl Run {
     /// What is kept of the run after an interruption.
     pub fn kept(&self, opened: &Opened) -> String {
-        let (config, frames) = (&opened.config, opened.recording.frames.len());
+        let (config, frames) = (&opened.config, self.expected(opened));
         let found = self.results.len();
         if found == 0 {
             "no frame was finished".to_owned()
@@ -276,7 +293,7 @@ impl Run {
     /// Finishes the animation; an error where not all frames were localized, which names what is kept.
     pub fn finish(self, opened: &Opened) -> Result<()> {
         let kept = self.kept(opened);
-        let is_complete = self.is_complete(&opened.recording);
+        let is_complete = self.is_complete(opened);
         let animation = self.movie.map_or(Ok(()), |movie| movie.finish());
         let failure = self.failure.or(animation.err());
         if is_complete && failure.is_none() {

@@ -27,13 +27,13 @@ pub fn localize<'a>(
     let start = start(&opened.config, &opened.map, &opened.recording);
     let mut tracker = FrameTracker::new(opened, motion, start)?;
     let task = context.progress.task("localize", frames.len());
-    for (row, frame) in frames.iter().enumerate() {
+    for frame in frames {
         if context.interrupt.requested() {
             break;
         }
         let mut process = || {
             let scan = frame.read()?;
-            let tracked = tracker.step(row, &scan)?;
+            let tracked = tracker.step(frame, &scan, None)?;
             recorded().record(frame, &scan, &tracked)
         };
         if let Err(error) = process() {
@@ -55,8 +55,9 @@ pub fn start(config: &LocalizationConfig, map: &Map, recording: &Recording) -> S
             spread,
         },
         (Initialization::Tracking, None) => {
-            let truth = recording.frames[0].map_from_lidar.unwrap_or_default();
-            Start::near(&truth, spread)
+            let first = recording.frames.first();
+            let truth = first.and_then(|frame| frame.map_from_lidar);
+            Start::near(&truth.unwrap_or_default(), spread)
         }
         (Initialization::Corridor, _) => Start::Road,
         (Initialization::Extent, _) if config.initialization.is_some() => Start::Anywhere,

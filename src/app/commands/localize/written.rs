@@ -13,12 +13,7 @@ use crate::localization::State;
 
 /// Completes the result.
 pub fn write_results(opened: &Opened, run: &mut Run) -> Result<()> {
-    let Opened {
-        config,
-        files,
-        recording,
-        ..
-    } = opened;
+    let Opened { config, files, .. } = opened;
     if !config.save_result || run.results.is_empty() {
         return Ok(());
     }
@@ -28,7 +23,7 @@ pub fn write_results(opened: &Opened, run: &mut Run) -> Result<()> {
     }
     run.finish_result()?;
     // The frames of an interrupted run are kept; a whole run lacks its report and pictures still.
-    if run.is_complete(recording) {
+    if run.is_complete(opened) {
         Ok(())
     } else {
         run.claims.finish(&files.result)
@@ -48,7 +43,7 @@ pub fn write_trajectories(opened: &Opened, run: &Run) -> Result<()> {
     }
     run_output::write_poses(files, &run.results)?;
     let results = &run.results;
-    let frames = run.frames(recording);
+    let frames = run.frames(opened);
     let mcl = Trajectory::of_filter(results, &frames);
     mcl.write(files, "mcl", recording, config.all_poses)?;
     if config.refine {
@@ -64,7 +59,7 @@ pub fn write_run(opened: &Opened, run: &mut Run, context: &Context) -> Result<Re
         config,
         files,
         map,
-        recording,
+        sensor,
         ..
     } = opened;
     let results = &run.results;
@@ -95,11 +90,10 @@ pub fn write_run(opened: &Opened, run: &mut Run, context: &Context) -> Result<Re
     if config.output.plots {
         let mesh = run_output::map_around(map, results.estimates.iter().flatten())?;
         run_output::draw_run(files, Some(&mesh), results)?;
-        let frames = run.frames(recording);
+        let frames = run.frames(opened);
         let mcl = Trajectory::of_filter(results, &frames);
-        if let Some((frame, pose)) = mcl.middle() {
-            let model = &opened.sensor.range_image;
-            run_output::draw_range_images(files, map, frame, pose, model)?;
+        if let (Some((frame, pose)), Some(sensor)) = (mcl.middle(), sensor) {
+            run_output::draw_range_images(files, map, frame, pose, &sensor.range_image)?;
         }
     }
     if config.save_result {

@@ -124,6 +124,9 @@ impl ResultWriter {
             particles.resize(self.capacity, [0.0; 4]);
             stream.push(bytemuck::cast_slice(&particles))?;
         }
+        if results.scan_outlines.is_none() {
+            self.outlines = None;
+        }
         if let (Some(stream), Some(outlines)) = (&mut self.outlines, &results.scan_outlines) {
             let mut points = outlines.row(row)?;
             points.resize(ScanOutline::MAX, [0; 2]);
