@@ -178,6 +178,13 @@ pub mod internals {
         pub use crate::map::files::ply::{read, read_map, write, write_joined};
     }
 
+    #[cfg(feature = "ros2")]
+    pub mod received {
+        pub use crate::recording::bags::received::{
+            ReceivedCloud, read_odometry, read_pose_with_deviations, read_transforms,
+        };
+    }
+
     pub mod scan_files {
         pub use crate::recording::scan_files::{is_scan, read, read_stamped};
     }

@@ -18,7 +18,7 @@ struct Restriction {
     reason: &'static str,
 }
 
-const RESTRICTIONS: [Restriction; 11] = [
+const RESTRICTIONS: [Restriction; 12] = [
     Restriction {
         words: &["memmap2::", "use memmap2"],
         allowed: &["shared_bytes.rs"],
@@ -48,6 +48,11 @@ const RESTRICTIONS: [Restriction; 11] = [
         words: &["rusqlite::", "ruzstd::", "lz4_flex::", "bzip2::"],
         allowed: &["recording/bags"],
         reason: "databases and compressions are confined to bags",
+    },
+    Restriction {
+        words: &["rustdds::", "use rustdds"],
+        allowed: &["app/commands/live/ros2"],
+        reason: "DDS is confined to the node of ROS 2",
     },
     Restriction {
         words: &["clap::", "use clap"],

@@ -133,6 +133,36 @@ fn bags_database() {
     fuzz("bags (.db3)", "a.db3", fuzzed::bags::database, read_bag);
 }
 
+#[cfg(feature = "ros2")]
+#[test]
+fn received_messages() {
+    use fpmcl::internals::received::{
+        ReceivedCloud, read_odometry, read_pose_with_deviations, read_transforms,
+    };
+
+    fuzz("messages (CDR)", "a.cdr", fuzzed::bags::message, |file| {
+        let message = file.bytes;
+        let cloud = ReceivedCloud::read(message, 1);
+        if let Ok(ReceivedCloud { scan, .. }) = &cloud {
+            assert!(scan.points.iter().all(|point| point.is_finite()));
+            assert!([0, scan.len()].contains(&scan.times_s.len()));
+        }
+        let proposal = read_pose_with_deviations(message);
+        let proposal = proposal.map(|(pose, deviations)| {
+            assert!(deviations.iter().all(|it| *it >= 0.0));
+            vec![pose]
+        });
+        let poses = [read_odometry(message), read_transforms(message), proposal];
+        for pose in poses.iter().flatten().flatten() {
+            check_pose(&pose.parent_from_child);
+        }
+        let is_read = cloud.is_ok() || poses.iter().any(Result::is_ok);
+        is_read
+            .then_some(())
+            .ok_or_else(|| "a.cdr is no message".to_owned())
+    });
+}
+
 /// Reads all scans, poses and transforms of a bag.
 #[cfg(feature = "bags")]
 fn read_bag(file: &Input) -> Result<(), String> {

@@ -103,7 +103,8 @@ Examples:
     #[command(after_help = "\
 Examples:
   fpmcl live --map map.ply --replay drive_2/  a recording at its own pace
-  fpmcl live --map map.ply --replay drive_2/ --rate 2 --start last --force")]
+  fpmcl live --map map.ply --replay drive_2/ --rate 2 --start last --force
+  fpmcl live --map map.ply --ros2 /points     a robot with ROS 2")]
     Live(LiveArgs),
 
     /// Refine the trajectory that `localize` found, or a rough one from anywhere.

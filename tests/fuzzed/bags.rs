@@ -42,6 +42,13 @@ pub fn database(u: &mut Unstructured) -> Result<Vec<u8>> {
     Ok(std::fs::read(path).unwrap())
 }
 
+/// A message of ROS 2.
+#[cfg(feature = "ros2")]
+pub fn message(u: &mut Unstructured) -> Result<Vec<u8>> {
+    let kind = *u.choose(&[Kind::CdrLittle, Kind::CdrBig])?;
+    Ok(recording(u, kind)?.swap_remove(0).data)
+}
+
 fn kind(u: &mut Unstructured) -> Result<Kind> {
     Ok(*u.choose(&[Kind::CdrLittle, Kind::CdrBig, Kind::Ros1])?)
 }

@@ -48,6 +48,8 @@ struct Shared {
     is_overdue: AtomicBool,
     /// Whether [`Interrupt::supervise`] ends the process.
     is_supervised: AtomicBool,
+    /// Whether a request was the end of a drive: the next signal ends the process.
+    is_accepted: AtomicBool,
     /// Held while files are written that belong together.
     saving: Mutex<()>,
     /// What is finished and kept, and where; empty if a command has not set it.
@@ -75,7 +77,8 @@ impl Interrupt {
     }
 
     fn signalled(&self) {
-        if self.shared.requested.swap(true, Ordering::Relaxed) {
+        let is_accepted = self.shared.is_accepted.load(Ordering::Relaxed);
+        if self.shared.requested.swap(true, Ordering::Relaxed) || is_accepted {
             files::abandon_writes();
             exit();
         }
@@ -101,6 +104,12 @@ impl Interrupt {
     /// Requests to stop, as a signal does.
     pub fn request(&self) {
         self.shared.requested.store(true, Ordering::Relaxed);
+    }
+
+    /// Takes a request to stop as the end of a drive that has no other: what follows may last. The next signal ends the process.
+    pub fn accept(&self) {
+        self.shared.is_accepted.store(true, Ordering::Relaxed);
+        self.shared.requested.store(false, Ordering::Relaxed);
     }
 
     /// Sets what is finished and kept from now on, for the message of an interruption.
@@ -172,6 +181,9 @@ impl Interrupt {
 
     fn exit_when_overdue(&self) {
         thread::sleep(GRACE);
+        if !self.requested() {
+            return;
+        }
         self.shared.is_overdue.store(true, Ordering::SeqCst);
         while self.shared.is_supervised.load(Ordering::SeqCst) {
             thread::sleep(POLL);

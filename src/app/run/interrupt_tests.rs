@@ -29,3 +29,14 @@ fn supervised_work_returns_its_value_and_nothing_is_saved() {
     let value = interrupt.supervise(|| 7, || unreachable!("the work is in time"));
     assert_eq!(value, 7);
 }
+
+#[test]
+fn a_request_that_was_the_end_of_a_drive_hurries_nothing() {
+    let interrupt = Interrupt::default();
+    interrupt.request();
+    interrupt.accept();
+    assert!(!interrupt.requested());
+    // It would end the process of the tests.
+    interrupt.exit_when_overdue();
+    assert!(!interrupt.shared.is_overdue.load(Ordering::SeqCst));
+}

@@ -80,6 +80,25 @@ pub fn read_poses(
     Ok(poses)
 }
 
+/// Reads a pose with its covariance: the standard deviations of its position, along the axis with the larger one [m], and of
+/// its heading [rad], as far as they are numbers.
+#[cfg(feature = "ros2")]
+pub fn read_proposal(fields: &mut Fields) -> Result<(FramePose, [f64; 2]), String> {
+    let header = Header::read(fields)?;
+    let pose = FramePose {
+        time_s: header.stamp_s,
+        parent: header.frame,
+        child: String::new(),
+        parent_from_child: pose(fields)?,
+    };
+    let mut covariance = [0.0; 36];
+    for number in &mut covariance {
+        *number = fields.f64()?;
+    }
+    let variances = [covariance[0].max(covariance[7]), covariance[35]];
+    Ok((pose, variances.map(|it| it.max(0.0).sqrt())))
+}
+
 /// A position or translation, and a quaternion x, y, z, w.
 fn pose(fields: &mut Fields) -> Result<Pose3, String> {
     let mut numbers = [0.0; 7];

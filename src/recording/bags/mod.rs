@@ -14,6 +14,8 @@ mod index;
 mod mcap_file;
 mod message;
 mod point_cloud;
+#[cfg(feature = "ros2")]
+pub(crate) mod received;
 mod ros1_file;
 mod transforms;
 

@@ -4,6 +4,7 @@ mod driving;
 mod last_pose;
 mod replay;
 mod robot;
+mod ros2;
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
@@ -16,8 +17,9 @@ use serde_json::json;
 use self::driving::Drive;
 use self::replay::replay;
 use self::robot::Robot;
+use self::ros2::arguments::Ros2Args;
 use super::export::{self, ExportArgs};
-use super::localize::opened::{Opened, open};
+use super::localize::opened::{Opened, open, open_driving};
 use super::localize::tracking::start;
 use super::localize::{DriveArgs, Recorded, run_with, start_pose};
 use super::motion_source::MotionSource;
@@ -49,9 +51,14 @@ pub struct LiveArgs {
     pub replay: Option<PathBuf>,
 
     /// How many times faster than it was recorded.
-    #[arg(long, value_name = "R", default_value_t = 1.0, value_parser = rate)]
+    #[arg(long, value_name = "R", default_value_t = 1.0, value_parser = rate, conflicts_with = "topic")]
     #[serde(skip)]
     pub rate: f64,
+
+    /// Topics, frames and networks of ROS 2.
+    #[command(flatten)]
+    #[serde(skip)]
+    pub ros2: Ros2Args,
 
     /// Start in the map [m, deg], or the last pose of a run with this output, which the scans must confirm.
     #[arg(long, value_name = "X,Y,HEADING | last", value_parser = live_start, allow_hyphen_values = true)]
@@ -125,7 +132,7 @@ fn rate(text: &str) -> Result<f64, &'static str> {
 }
 
 impl LiveArgs {
-    /// The configuration: a file, in which the recording is a setting, else the recording, as the argument of `localize`.
+    /// The configuration: a file, in which the recording or the topic is a setting, else that, as the argument of `localize`.
     pub fn source(&self) -> Result<ConfigArgs> {
         if let Some(input) = self.run.source.input() {
             bail!(
@@ -135,23 +142,29 @@ impl LiveArgs {
             );
         }
         let mut source = self.run.source.clone();
-        match (&source.config, &self.replay) {
-            (Some(_), Some(replay)) => {
-                let setting = ("scan_folder".to_owned(), yaml(&json!(replay)));
+        let topic = self.ros2.topic.as_ref().map(PathBuf::from);
+        let scans = self.replay.clone().or(topic);
+        match (&source.config, &scans) {
+            (Some(_), Some(scans)) => {
+                let setting = ("scan_folder".to_owned(), yaml(&json!(scans)));
                 source.settings.push(setting);
             }
-            _ => source.config.clone_from(&self.replay),
+            _ => source.config = scans,
         }
         Ok(source)
     }
 }
 
-/// Localizes the scans of a recording as they arrive.
+/// Localizes the scans of a recording or of a robot as they arrive.
 pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> Result<Report> {
     if config.refine {
         bail!(
             "refine is True, but a pose that is refined is not known while the car drives; set refine to False, and run fpmcl refine with the result"
         );
+    }
+    let topic = args.ros2.topic.as_deref();
+    if let Some(topic) = topic {
+        check_topic(topic, config)?;
     }
     let last = match args.start {
         Some(LiveStart::Last) => last_pose::read(config)?,
@@ -163,6 +176,7 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
     });
     let claimed = log.map(|log| export::check(&log, context)).transpose()?;
     let sinks = sinks(args)?;
+    let open = if topic.is_some() { open_driving } else { open };
     let opened = open(config, &[last_pose::FILE], context);
     let localize = |opened: &Opened, motion: &mut MotionSource, recorded: Recorded<'_, '_>| {
         let start = last.as_ref().map_or_else(
@@ -176,6 +190,10 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
             queue: usize::from(args.queue),
             context,
         };
+        #[cfg(feature = "ros2")]
+        if let Some(topic) = topic {
+            return ros2::drive(&args.ros2, topic, &drive, motion, start, sinks);
+        }
         let (frames, interrupt) = (&opened.recording.frames, &context.interrupt);
         drive.run(
             motion,
@@ -194,6 +212,19 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
         }
     }
     report
+}
+
+/// Requires that the clouds of a topic can be localized.
+#[cfg(feature = "ros2")]
+fn check_topic(_topic: &str, config: &LocalizationConfig) -> Result<()> {
+    ros2::check(config)
+}
+
+#[cfg(not(feature = "ros2"))]
+fn check_topic(topic: &str, _config: &LocalizationConfig) -> Result<()> {
+    bail!(
+        "--ros2 {topic}: this program was built without ROS 2; build it with --features ros2, or replay a recording with --replay RECORDING"
+    );
 }
 
 /// Where it is sent what is known while the car drives.

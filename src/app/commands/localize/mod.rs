@@ -29,7 +29,7 @@ use crate::app::settings::LocalizationConfig;
 #[derive(Clone, Debug, Args, Serialize)]
 pub struct DriveArgs {
     /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
-    #[arg(long = "odometry", value_name = "FILE")]
+    #[arg(long = "odometry", alias = "odom", value_name = "FILE")]
     pub odometry_file: Option<PathBuf>,
 
     /// True poses of the recording for the report; sets the key `pose_file`.

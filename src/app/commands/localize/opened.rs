@@ -1,5 +1,7 @@
 //! The inputs of a localization, opened, and its outputs, claimed.
 
+use std::collections::VecDeque;
+use std::iter;
 use std::path::Path;
 
 use anyhow::Result;
@@ -8,8 +10,9 @@ use super::super::motion_source::MotionSource;
 use super::super::stages::{RecordingInputs, input_files};
 use crate::app::report::RunFiles;
 use crate::app::report::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES};
-use crate::app::run::{Claims, Context, NPZ, Outputs};
-use crate::app::settings::LocalizationConfig;
+use crate::app::run::{Claims, Context, NPZ, Outputs, input};
+use crate::app::settings::{LocalizationConfig, OdometrySource};
+use crate::lidar::Scan;
 use crate::map::Map;
 use crate::random::stream;
 use crate::recording::Recording;
@@ -63,6 +66,32 @@ pub fn open(
         map,
         recording,
         sensor: Some(sensor),
+    };
+    Ok((opened, motion, claims))
+}
+
+/// Opens the map for scans that a robot sends, as [`open`] does for those of a recording.
+pub fn open_driving(
+    config: &LocalizationConfig,
+    further_files: &[&'static str],
+    context: &Context,
+) -> Result<(Opened, MotionSource, Claims)> {
+    let files = RunFiles::new(&config.result_path);
+    context.interrupt.keeps("no scan was localized");
+    let mut read = config.map_input.files();
+    input::require(&read)?;
+    read.extend(context.input());
+    let claims = prepare(config, read, further_files, &files)?;
+    let opened = Opened {
+        config: config.clone(),
+        files,
+        map: config.map_input.load(config.map_options(), context)?,
+        recording: Recording::from_scans(iter::empty::<Scan>()),
+        sensor: None,
+    };
+    let motion = match config.motion.odometry {
+        OdometrySource::None => MotionSource::Unknown,
+        _ => MotionSource::Scans(VecDeque::new()),
     };
     Ok((opened, motion, claims))
 }

@@ -1,0 +1,150 @@
+//! Arguments of a node of ROS 2.
+
+use std::net::IpAddr;
+
+use anyhow::{Result, ensure};
+use clap::Args;
+
+/// Topics, frames and networks of ROS 2.
+#[derive(Clone, Debug, Args)]
+pub struct Ros2Args {
+    /// Topic of ROS 2 whose clouds are localized (sensor_msgs/PointCloud2), as a node without ROS; --odometry may be a topic, too.
+    #[arg(long = "ros2", value_name = "TOPIC", group = "source", value_parser = topic)]
+    pub topic: Option<String>,
+
+    /// Domain of ROS 2; by default ROS_DOMAIN_ID, else 0.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
+    pub domain: Option<u16>,
+
+    /// Address of this machine in the network of ROS 2; by default all, or what ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_LOCALHOST_ONLY allow.
+    #[arg(long, value_name = "IP")]
+    pub interface: Option<IpAddr>,
+
+    /// Frame of the map in ROS 2.
+    #[arg(long, value_name = "FRAME", default_value = "map")]
+    pub map_frame: String,
+
+    /// Frame of the robot in ROS 2; poses are those of the lidar where no static transform joins the two.
+    #[arg(long, value_name = "FRAME", default_value = "base_link")]
+    pub base_frame: String,
+
+    /// Another name of a topic of ROS 2; repeatable.
+    #[arg(long, value_name = "FROM:=TO", value_parser = remapping)]
+    pub remap: Vec<(String, String)>,
+}
+
+impl Ros2Args {
+    /// The name of a topic after remapping.
+    pub fn remapped<'a>(&'a self, topic: &'a str) -> &'a str {
+        let found = self.remap.iter().find(|(from, _)| from == topic);
+        found.map_or(topic, |(_, to)| to)
+    }
+
+    /// The domain, of the flag or of the variable of ROS 2.
+    pub fn domain(&self, variable: Option<&str>) -> Result<u16> {
+        match (self.domain, variable.map(str::trim)) {
+            (Some(domain), _) => Ok(domain),
+            (None, None | Some("")) => Ok(0),
+            (None, Some(text)) => {
+                let domain = text.parse::<u16>().ok().filter(|it| *it <= 232);
+                domain.ok_or_else(|| {
+                    anyhow::anyhow!("ROS_DOMAIN_ID is {text}; set a number from 0 to 232")
+                })
+            }
+        }
+    }
+
+    /// Addresses of the networks that are used, of the flag or of ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_LOCALHOST_ONLY; `None`:
+    /// all.
+    pub fn networks(
+        &self,
+        range: Option<&str>,
+        is_local_only: Option<&str>,
+    ) -> Result<Option<Vec<IpAddr>>> {
+        ensure!(
+            self.interface.is_some() || range != Some("OFF"),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so that no topic is found; set it to LOCALHOST or SUBNET, or give --interface IP"
+        );
+        Ok(match self.interface {
+            Some(interface) => Some(vec![interface]),
+            None if range == Some("LOCALHOST") || is_local_only == Some("1") => {
+                Some(vec![IpAddr::from([127, 0, 0, 1])])
+            }
+            None => None,
+        })
+    }
+}
+
+/// Parses the name of a topic.
+fn topic(text: &str) -> Result<String, &'static str> {
+    let is_name = |part: &str| {
+        let is_digit = part.starts_with(|c: char| c.is_ascii_digit());
+        let is_part = |c: char| c.is_ascii_alphanumeric() || c == '_';
+        !part.is_empty() && !is_digit && part.chars().all(is_part)
+    };
+    let absolute = text.strip_prefix('/').unwrap_or(text);
+    if absolute.split('/').all(is_name) {
+        Ok(format!("/{absolute}"))
+    } else {
+        Err("give the name of a topic, such as /points")
+    }
+}
+
+fn remapping(text: &str) -> Result<(String, String), &'static str> {
+    let help = "give two topics, such as /fpmcl/pose:=/pose";
+    let (from, to) = text.split_once(":=").ok_or(help)?;
+    Ok((topic(from).or(Err(help))?, topic(to).or(Err(help))?))
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser as _;
+
+    use super::*;
+
+    #[derive(clap::Parser)]
+    #[command(group = clap::ArgGroup::new("source"))]
+    struct Arguments {
+        #[command(flatten)]
+        ros2: Ros2Args,
+    }
+
+    fn arguments(words: &[&str]) -> Ros2Args {
+        let words = ["live"].iter().chain(words);
+        Arguments::try_parse_from(words).unwrap().ros2
+    }
+
+    #[test]
+    fn flags_take_precedence_over_the_variables_of_ros() {
+        let (given, none) = (arguments(&["--domain=7"]), arguments(&[]));
+        assert_eq!(given.domain(Some("3")).unwrap(), 7);
+        assert_eq!(none.domain(Some("3")).unwrap(), 3);
+        assert_eq!(none.domain(None).unwrap(), 0);
+        for wrong in ["here", "233", "-1"] {
+            let error = none.domain(Some(wrong)).unwrap_err().to_string();
+            assert!(error.contains(wrong), "{error}");
+        }
+        let local = IpAddr::from([127, 0, 0, 1]);
+        assert_eq!(none.networks(None, None).unwrap(), None);
+        assert_eq!(none.networks(Some("SUBNET"), Some("0")).unwrap(), None);
+        for (range, local_only) in [(Some("LOCALHOST"), None), (None, Some("1"))] {
+            let networks = none.networks(range, local_only).unwrap();
+            assert_eq!(networks, Some(vec![local]));
+        }
+        assert!(none.networks(Some("OFF"), None).is_err());
+        let given = arguments(&["--interface=10.0.0.7"]);
+        let networks = given.networks(Some("OFF"), Some("1")).unwrap();
+        assert_eq!(networks, Some(vec![IpAddr::from([10, 0, 0, 7])]));
+    }
+
+    #[test]
+    fn names_of_topics_are_absolute_and_may_be_replaced() {
+        let ros2 = arguments(&["--ros2=points", "--remap=fpmcl/pose:=/pose"]);
+        assert_eq!(ros2.topic.as_deref(), Some("/points"));
+        assert_eq!(ros2.remapped("/fpmcl/pose"), "/pose");
+        assert_eq!(ros2.remapped("/fpmcl/map"), "/fpmcl/map");
+        for wrong in ["", "/", "/a//b", "/1", "/a b", "/é"] {
+            assert!(topic(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,106 @@
+//! A drive whose scans a robot sends.
+
+use std::cell::RefCell;
+use std::env;
+use std::iter;
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::{Result, bail};
+
+use super::arguments::Ros2Args;
+use super::node::Node;
+use super::publisher::Publisher;
+use super::receiver::Receiver;
+use super::shared::Shared;
+use crate::app::commands::live::driving::Drive;
+use crate::app::commands::live::robot::Robot;
+use crate::app::commands::motion_source::MotionSource;
+use crate::app::report::export::Sinks;
+use crate::app::report::run_output;
+use crate::app::settings::{LocalizationConfig, OdometrySource};
+use crate::localization::Start;
+
+/// Name of the node.
+const NAME: &str = "fpmcl";
+
+/// Requires that a configuration asks for nothing that only a recording has.
+pub fn check(config: &LocalizationConfig) -> Result<()> {
+    if let Some(poses) = &config.given_poses.pose_file {
+        bail!(
+            "pose_file is {}, but a robot that drives has no true poses; set pose_file to null, and the start by --start X,Y,HEADING",
+            poses.display()
+        );
+    }
+    let odometry = config.motion.odometry_file.as_deref();
+    if let Some(file) = odometry.filter(|it| !it.starts_with("/")) {
+        bail!(
+            "odometry_file is {}, but that of a robot is a topic, such as /odom",
+            file.display()
+        );
+    }
+    Ok(())
+}
+
+/// Localizes the clouds of a topic until it is requested to stop.
+pub fn drive(
+    args: &Ros2Args,
+    clouds: &str,
+    drive: &Drive,
+    motion: &mut MotionSource,
+    start: Start,
+    sinks: Sinks,
+) -> Result<()> {
+    let config = &drive.opened.config;
+    let variable = |name: &str| env::var(name).ok();
+    let domain = args.domain(variable("ROS_DOMAIN_ID").as_deref())?;
+    let (range, is_local_only) = (
+        variable("ROS_AUTOMATIC_DISCOVERY_RANGE"),
+        variable("ROS_LOCALHOST_ONLY"),
+    );
+    let networks = args.networks(range.as_deref(), is_local_only.as_deref())?;
+    let odometry = match config.motion.odometry {
+        OdometrySource::Auto | OdometrySource::File => config
+            .motion
+            .odometry_file
+            .as_deref()
+            .and_then(Path::to_str),
+        _ => None,
+    };
+    let shared = Shared::new(&args.map_frame, &args.base_frame);
+    let mut node = Node::open(NAME, domain, networks)?;
+    let receiver = Receiver::new(
+        &mut node,
+        args,
+        clouds,
+        odometry,
+        config.recording.elevation_bias_deg,
+    )?;
+    let publisher = Publisher::new(&mut node, args, &shared)?;
+    node.announce()?;
+    tracing::info!(
+        "node /{NAME} of ROS 2 in domain {domain} localizes the clouds of {}",
+        args.remapped(clouds)
+    );
+    let mesh = run_output::map_around(&drive.opened.map, iter::empty())?;
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    publisher.map(&mesh.vertices, now.map_or(0, |it| it.as_nanos() as u64));
+    drop(mesh);
+
+    let publisher = RefCell::new(publisher);
+    let robot = Robot {
+        odom_from_lidar: Box::new(|time_s| odometry.and_then(|_| shared.odom_from_lidar(time_s))),
+        proposed: Box::new(|| shared.proposed()),
+        localized: Box::new(|frame| publisher.borrow_mut().localized(frame)),
+        waiting: Box::new(|time_s, reason| publisher.borrow_mut().waiting(time_s, reason)),
+    };
+    let interrupt = &drive.context.interrupt;
+    drive.run(motion, start, sinks, robot, |inbox, unreadable| {
+        receiver.run(&node, &shared, inbox, unreadable, interrupt);
+    })?;
+    if (drive.recorded)().results.is_empty() {
+        bail!("no scan of {} was localized", args.remapped(clouds));
+    }
+    interrupt.accept();
+    Ok(())
+}

@@ -1,0 +1,305 @@
+//! What the node says: pose, odometry, transform, diagnostics, and the map once.
+//!
+//! The transform is that of REP-105 (Meeussen, *Coordinate Frames for Mobile Platforms*, 2010): from the map to the frame of the
+//! odometry where somebody publishes the robot in it, else to the robot; never both, and only while the pose is believed.
+
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use glam::Vec3;
+use nalgebra::{Matrix3, Matrix6, Vector3};
+
+use super::arguments::Ros2Args;
+use super::cdr::Cdr;
+use super::node::{Node, Quality, Writer};
+use super::shared::{Place, Shared};
+use crate::app::report::export::LiveFrame;
+use crate::evaluation::trust::Axes;
+use crate::geometry::Pose3;
+use crate::lidar::Motion;
+use crate::live::{LiveState, Reason};
+use crate::localization::Estimate;
+
+/// Time between two diagnostics of the same state.
+const DIAGNOSTICS: Duration = Duration::from_secs(1);
+
+/// Largest number of points of the map that is published.
+const MOST_POINTS: usize = 500_000;
+
+/// Messages that are kept for slow readers of reliable topics.
+const DEPTH: i32 = 10;
+
+/// The topics that are offered.
+pub struct Publisher<'a> {
+    shared: &'a Shared,
+    pose: Writer,
+    odometry: Writer,
+    transforms: Writer,
+    diagnostics: Writer,
+    map: Writer,
+    /// The reason of the last diagnostics, and when they were sent.
+    last: Option<(Reason, Instant)>,
+}
+
+impl<'a> Publisher<'a> {
+    /// Offers the topics.
+    pub fn new(node: &mut Node, args: &Ros2Args, shared: &'a Shared) -> Result<Self> {
+        let mut writer = |topic: &str, message_type: &str, quality, depth| {
+            node.writer(args.remapped(topic), message_type, quality, depth)
+        };
+        let reliable = Quality::Reliable;
+        Ok(Self {
+            shared,
+            pose: writer(
+                "/fpmcl/pose",
+                "geometry_msgs/msg/PoseWithCovarianceStamped",
+                reliable,
+                DEPTH,
+            )?,
+            odometry: writer("/fpmcl/odometry", "nav_msgs/msg/Odometry", reliable, DEPTH)?,
+            transforms: writer("/tf", "tf2_msgs/msg/TFMessage", reliable, DEPTH)?,
+            diagnostics: writer(
+                "/diagnostics",
+                "diagnostic_msgs/msg/DiagnosticArray",
+                reliable,
+                DEPTH,
+            )?,
+            map: writer(
+                "/fpmcl/map",
+                "sensor_msgs/msg/PointCloud2",
+                Quality::Latched,
+                1,
+            )?,
+            last: None,
+        })
+    }
+
+    /// Publishes the points of the map, of large maps each n-th one.
+    pub fn map(&self, points: &[Vec3], stamp_ns: u64) {
+        let step = points.len().div_ceil(MOST_POINTS).max(1);
+        let points: Vec<Vec3> = points.iter().copied().step_by(step).collect();
+        self.map
+            .send(cloud(&points, stamp_ns, &self.shared.map_frame));
+    }
+
+    /// Publishes a frame that was localized.
+    pub fn localized(&mut self, frame: &LiveFrame) {
+        let Some(place) = self.shared.place(frame.number, frame.time_s) else {
+            return;
+        };
+        if frame.reason.state().is_believed() {
+            self.believed(&frame.estimate, &place);
+        }
+        let deviations = Axes::new(&frame.estimate.covariance, &frame.estimate.pose);
+        let [_, _, heading_rad] = frame.estimate.standard_deviations();
+        let agreement = frame
+            .estimate
+            .agreement
+            .map_or("unknown".to_owned(), |it| format!("{it:.3}"));
+        let values: [(&str, &dyn std::fmt::Display); 7] = [
+            ("agreement", &agreement),
+            (
+                "latency [ms]",
+                &format!("{:.1}", 1e3 * frame.latency.as_secs_f64()),
+            ),
+            ("dropped scans", &frame.dropped),
+            ("places", &frame.estimate.places),
+            (
+                "larger standard deviation of the position [m]",
+                &format!("{:.3}", deviations.long_m),
+            ),
+            (
+                "standard deviation of the heading [deg]",
+                &format!("{:.3}", heading_rad.to_degrees()),
+            ),
+            ("frame", &frame.number),
+        ];
+        self.diagnose(frame.reason, place.moment_ns, &values);
+    }
+
+    /// Publishes the state at a time [s] without a scan.
+    pub fn waiting(&mut self, time_s: f64, reason: Reason) {
+        self.diagnose(reason, (1e9 * time_s.max(0.0)) as u64, &[]);
+    }
+
+    fn believed(&self, estimate: &Estimate, place: &Place) {
+        let (map, stamp_ns) = (self.shared.map_frame.as_str(), place.moment_ns);
+        let lidar_from_child = place.child_from_lidar.inverse();
+        let map_from_child = estimate.map_from_lidar * lidar_from_child;
+        let covariance = covariance_of_child(estimate, &map_from_child);
+        let pose = Cdr::with_header(stamp_ns, map).pose(&map_from_child);
+        self.pose.send(pose.covariance(&covariance));
+        let [linear, angular] = velocity(estimate.motion.as_ref(), &lidar_from_child);
+        let odometry = Cdr::with_header(stamp_ns, map).text(&place.child);
+        let odometry = odometry.pose(&map_from_child).covariance(&covariance);
+        let odometry = odometry
+            .twist(linear, angular)
+            .covariance(&Matrix6::zeros());
+        self.odometry.send(odometry);
+        let (child, transform) = match &place.odom_from_child {
+            Some((odom, Some(pose))) => (odom, map_from_child * pose.inverse()),
+            Some((_, None)) => return,
+            None => (&place.child, map_from_child),
+        };
+        let message = Cdr::default().u32(1).header(stamp_ns, map).text(child);
+        self.transforms.send(message.pose(&transform));
+    }
+
+    /// Publishes the state, where it has changed or was not published for a while.
+    fn diagnose(
+        &mut self,
+        reason: Reason,
+        stamp_ns: u64,
+        values: &[(&str, &dyn std::fmt::Display)],
+    ) {
+        let is_recent =
+            |(last, at): &(Reason, Instant)| *last == reason && at.elapsed() < DIAGNOSTICS;
+        if self.last.as_ref().is_some_and(is_recent) {
+            return;
+        }
+        self.last = Some((reason, Instant::now()));
+        let state = reason.state();
+        let message = format!("{}: {}", state.word(), reason.words());
+        let mut all: Vec<(&str, &dyn std::fmt::Display)> = Vec::with_capacity(values.len() + 2);
+        let (word, words) = (state.word(), reason.words());
+        all.extend([
+            ("state", &word as &dyn std::fmt::Display),
+            ("reason", &words),
+        ]);
+        all.extend(values);
+        let array = Cdr::with_header(stamp_ns, "").u32(1).u8(level(state));
+        let status = array
+            .text("fpmcl: localization")
+            .text(&message)
+            .text("fpmcl");
+        self.diagnostics.send(status.values(&all));
+    }
+}
+
+/// Levels of `diagnostic_msgs/DiagnosticStatus`: OK, WARN, ERROR.
+fn level(state: LiveState) -> u8 {
+    match state {
+        LiveState::Tracking => 0,
+        LiveState::Starting | LiveState::Searching | LiveState::Coasting => 1,
+        LiveState::Lost => 2,
+    }
+}
+
+/// The covariance of the child frame, x, y, z, roll, pitch, yaw: that of the lidar, whose heading moves a frame that is
+/// d = (dx, dy) away by (−dy, dx) per radian. Zero where nothing is estimated.
+fn covariance_of_child(estimate: &Estimate, map_from_child: &Pose3) -> Matrix6<f64> {
+    /// Rows of x, y and heading.
+    const ROWS: [usize; 3] = [0, 1, 5];
+    let d = map_from_child.translation.vector - estimate.map_from_lidar.translation.vector;
+    let lever = Matrix3::new(1.0, 0.0, -d.y, 0.0, 1.0, d.x, 0.0, 0.0, 1.0);
+    let planar = lever * estimate.covariance * lever.transpose();
+    let mut covariance = Matrix6::zeros();
+    for (i, row) in ROWS.into_iter().enumerate() {
+        for (j, column) in ROWS.into_iter().enumerate() {
+            covariance[(row, column)] = planar[(i, j)];
+        }
+    }
+    covariance
+}
+
+/// Velocity [m/s] and turn rate [rad/s] of the child frame in itself; zero while they are not known.
+fn velocity(motion: Option<&Motion>, lidar_from_child: &Pose3) -> [Vector3<f64>; 2] {
+    let Some(motion) = motion else {
+        return [Vector3::zeros(); 2];
+    };
+    let moved = lidar_from_child.inverse() * motion.previous_from_current * lidar_from_child;
+    let [linear, angular] = [moved.translation.vector, moved.rotation.scaled_axis()];
+    [linear / motion.duration_s, angular / motion.duration_s]
+}
+
+/// `sensor_msgs/PointCloud2` of points, of 32 bits each.
+fn cloud(points: &[Vec3], stamp_ns: u64, frame: &str) -> Cdr {
+    const FLOAT_32: u8 = 7;
+    const POINT_BYTES: u32 = 12;
+    let count = points.len() as u32;
+    let mut cloud = Cdr::with_header(stamp_ns, frame).u32(1).u32(count).u32(3);
+    for (name, offset) in [("x", 0), ("y", 4), ("z", 8)] {
+        cloud = cloud.text(name).u32(offset).u8(FLOAT_32).u32(1);
+    }
+    let cloud = cloud.u8(false).u32(POINT_BYTES).u32(POINT_BYTES * count);
+    cloud.bytes(bytemuck::cast_slice(points)).u8(true)
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+
+    use super::*;
+    use crate::recording::bags::received::{
+        ReceivedCloud, read_odometry, read_pose_with_deviations, read_transforms,
+    };
+
+    /// A message with the header of little-endian CDR.
+    fn received(message: Cdr) -> Vec<u8> {
+        [&[0, 1, 0, 0], message.finish().as_slice()].concat()
+    }
+
+    fn pose() -> Pose3 {
+        Pose3::new(Vector3::new(4.0, -2.0, 1.5), Vector3::new(0.1, -0.2, 2.0))
+    }
+
+    #[test]
+    fn what_is_sent_is_read_again_as_it_was() {
+        let points: Vec<Vec3> = (0..5).map(|k| Vec3::new(k as f32, -1.0, 0.5)).collect();
+        // Names of all lengths: what follows is aligned.
+        for name in ["m", "ma", "map", "map1", "map12"] {
+            let sent = received(cloud(&points, 1_700_000_000_123_456_789, name));
+            let read = ReceivedCloud::read(&sent, 0).unwrap();
+            assert_eq!(
+                (read.scan.points, read.frame.as_str()),
+                (points.clone(), name)
+            );
+            assert_eq!(read.moment_ns, 1_700_000_000_123_456_789);
+            let mut covariance = Matrix6::zeros();
+            (covariance[(0, 0)], covariance[(1, 1)], covariance[(5, 5)]) = (0.04, 0.25, 0.01);
+            let message = Cdr::with_header(5, name)
+                .pose(&pose())
+                .covariance(&covariance);
+            let (read, deviations) = read_pose_with_deviations(&received(message)).unwrap();
+            assert_relative_eq!(read.parent_from_child, pose(), epsilon = 1e-12);
+            assert_relative_eq!(
+                deviations.as_slice(),
+                [0.5, 0.1].as_slice(),
+                epsilon = 1e-12
+            );
+            let message = Cdr::default()
+                .u32(1)
+                .header(5, "map")
+                .text(name)
+                .pose(&pose());
+            let read = read_transforms(&received(message)).unwrap();
+            assert_eq!(
+                (read[0].parent.as_str(), read[0].child.as_str()),
+                ("map", name)
+            );
+            assert_relative_eq!(read[0].parent_from_child, pose(), epsilon = 1e-12);
+            let message = Cdr::with_header(5, "odom").text(name).pose(&pose());
+            assert_eq!(read_odometry(&received(message)).unwrap()[0].child, name);
+        }
+    }
+
+    #[test]
+    fn a_cloud_without_a_stamp_has_that_of_its_arrival() {
+        let sent = received(cloud(&[Vec3::ONE], 0, "lidar"));
+        assert_eq!(ReceivedCloud::read(&sent, 17).unwrap().moment_ns, 17);
+    }
+
+    #[test]
+    fn the_velocity_is_that_of_the_child_frame() {
+        // Turning on the spot: a frame 2 m ahead of the lidar moves to the left.
+        let motion = Motion {
+            previous_from_current: Pose3::rotation(Vector3::z() * 1e-3),
+            duration_s: 0.1,
+        };
+        let ahead = Pose3::translation(2.0, 0.0, 0.0);
+        let [linear, angular] = velocity(Some(&motion), &ahead);
+        assert_relative_eq!(linear, Vector3::new(0.0, 0.02, 0.0), epsilon = 1e-4);
+        assert_relative_eq!(angular, Vector3::new(0.0, 0.0, 0.01), epsilon = 1e-9);
+        assert_eq!(velocity(None, &ahead), [Vector3::zeros(); 2]);
+    }
+}

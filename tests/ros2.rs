@@ -1,0 +1,281 @@
+//! `live --ros2`: clouds that a robot sends by Cyclone DDS, and what it receives. In a network namespace of their own, where the
+//! loopback is the only interface.
+
+#![cfg(all(target_os = "linux", feature = "ros2"))]
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::path::Path;
+use std::process::Command;
+
+use common::Recording;
+use fpmcl::internals::app::LocalizationResults;
+use serde_json::{Value, json};
+
+const RESULT: &str = "results/localization.npz";
+
+/// Time of the first frame of the robot in `tests/ros2/robot.py` [s].
+const FIRST_S: f64 = 1.0;
+
+/// Runs a program in a network namespace, whose interpreter is given as `$PYTHON`.
+const IN_NAMESPACE: &str = "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo && exec \"$@\"";
+
+/// A street with its map, whose frames have the times of the robot.
+fn street() -> Recording {
+    let recording = Recording::street(12);
+    recording.fpmcl("build-map").succeeds();
+    let times = (0..12).map(|frame| format!("{:.1}\n", FIRST_S + 0.1 * f64::from(frame)));
+    recording.write("times.txt", &times.collect::<String>());
+    recording
+}
+
+fn in_namespace() -> Command {
+    let mut command = Command::new("unshare");
+    command.args(["--map-root-user", "--net", "sh", "-c", IN_NAMESPACE, "sh"]);
+    command
+}
+
+/// Runs a scenario of the robot; `None`, with a message, where what it needs is missing.
+fn robot(recording: &Recording, scenario: &str, arguments: &[&str]) -> Option<Value> {
+    let Some(python) = common::python_with("cyclonedds", "ros2") else {
+        common::skips::skipped("FPMCL_PYTHON names no interpreter with cyclonedds");
+        return None;
+    };
+    let probe = in_namespace().args(["true"]).output();
+    if !probe.is_ok_and(|it| it.status.success()) {
+        common::skips::skipped("this machine makes no network namespace (unshare, ip)");
+        return None;
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/ros2/robot.py");
+    let mut command = in_namespace();
+    command
+        .arg(python)
+        .arg(script)
+        .args(["play", "velodyne", scenario, "--"]);
+    command.arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
+    command.args(["live", "localization.yml", "--backend=cpu", "--json"]);
+    command.args(["--ros2=/points", "--start=0,0,0", "--queue=1000"]);
+    command.args(["--set", "pose_file=null", "--set", "pose_tracking=null"]);
+    command.args([
+        "--set",
+        "odometry=auto",
+        "--output",
+        "live/localization.npz",
+    ]);
+    for variable in [
+        "ROS_DOMAIN_ID",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "ROS_LOCALHOST_ONLY",
+        "CYCLONEDDS_URI",
+    ] {
+        command.env_remove(variable);
+    }
+    let output = command
+        .args(arguments)
+        .current_dir(recording.folder())
+        .output()
+        .unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{stderr}");
+    Some(serde_json::from_slice(&output.stdout).unwrap())
+}
+
+/// Poses x, y, z of a topic by their frames.
+fn positions(messages: &Value) -> Vec<(usize, [f64; 3])> {
+    let messages = messages.as_array().map(Vec::as_slice).unwrap_or_default();
+    let frame = |it: &Value| (it["stamp_ns"].as_f64().unwrap() * 1e-8).round() as usize - 10;
+    let position = |it: &Value| [0, 1, 2].map(|axis| it["pose"][axis].as_f64().unwrap());
+    messages
+        .iter()
+        .map(|it| (frame(it), position(it)))
+        .collect()
+}
+
+fn distance_m(a: [f64; 3], b: [f64; 3]) -> f64 {
+    let squares = a.iter().zip(b).map(|(a, b)| (a - b).powi(2));
+    squares.sum::<f64>().sqrt()
+}
+
+/// Whether the messages of the states contain some words in order.
+fn states_include(received: &Value, expected: &[&str]) -> bool {
+    let states = received["/diagnostics"].as_array().unwrap();
+    let mut left = states.iter().map(|it| it["message"].as_str().unwrap());
+    expected
+        .iter()
+        .all(|words| left.any(|it| it.contains(words)))
+}
+
+#[test]
+fn a_robot_receives_the_poses_that_localize_finds_on_the_same_scans() {
+    let recording = street();
+    let Some(outcome) = robot(&recording, "drive", &[]) else {
+        return;
+    };
+    let call = recording.fpmcl("localize").set("odometry", "scans");
+    let call = call.set("pose_file", "null").set("pose_tracking", "null");
+    call.with("--start=0,0,0").succeeds();
+    let localized = LocalizationResults::read(&recording.path(RESULT)).unwrap();
+    let localized = localized.estimates_in_space.unwrap();
+    let (received, report) = (&outcome["received"], &outcome["report"]);
+    assert_eq!(report["live"]["received"], 12, "{report}");
+    assert_eq!(report["live"]["dropped"], 0, "{report}");
+    for topic in ["/fpmcl/pose", "/fpmcl/odometry"] {
+        let poses = positions(&received[topic]);
+        // A message may be overtaken by the discovery of its reader only, and the first scan waits for that.
+        assert_eq!(poses.len(), 12, "{topic}");
+        for (frame, position) in poses {
+            let expected = localized[frame].translation.vector.into();
+            assert!(
+                distance_m(position, expected) < 1e-3,
+                "{topic} {frame} {position:?}"
+            );
+        }
+    }
+    for transform in received["/tf"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .flat_map(|it| it.as_array().unwrap())
+    {
+        let names = ["parent", "child"].map(|key| transform[key].as_str().unwrap());
+        assert_eq!(names, ["map", "lidar"]);
+        let (frame, position) = positions(&json!([transform]))[0];
+        assert!(distance_m(position, localized[frame].translation.vector.into()) < 1e-3);
+    }
+    assert_eq!(received["/tf"].as_array().unwrap().len(), 12);
+    // Five metres per second, straight ahead.
+    let last = &received["/fpmcl/odometry"][11];
+    let speed = ["forward_m_per_s", "turn_rad_per_s"].map(|key| last[key].as_f64().unwrap());
+    assert!(
+        (speed[0] - 5.0).abs() < 0.5 && speed[1].abs() < 0.1,
+        "{last}"
+    );
+    let covariance = received["/fpmcl/pose"][11]["covariance"]
+        .as_array()
+        .unwrap();
+    assert!(covariance[0].as_f64() > Some(0.0) && covariance[35].as_f64() > Some(0.0));
+    let map = &received["/fpmcl/map"][0];
+    let points = map["points"].as_u64().unwrap();
+    assert!(
+        points > 1000 && map["bytes"] == 12 * points && map["frame"] == "map",
+        "{map}"
+    );
+    let of_state = |it: &&Value| it["message"] == "tracking: the scan agrees with the map";
+    let tracking = received["/diagnostics"].as_array().unwrap();
+    let tracking = tracking.iter().find(of_state).unwrap();
+    assert_eq!(tracking["name"], "fpmcl: localization");
+    let values = ["state", "reason", "dropped scans"].map(|key| &tracking["values"][key]);
+    assert_eq!(values, ["tracking", "the scan agrees with the map", "0"]);
+    for number in ["agreement", "latency [ms]"] {
+        let text = tracking["values"][number].as_str().unwrap();
+        assert!(text.parse::<f64>().unwrap() > 0.0, "{tracking}");
+    }
+
+    // What remains of the drive is what localize writes.
+    let written = LocalizationResults::read(&recording.path("live/localization.npz")).unwrap();
+    for (written, localized) in written.estimates_in_space.unwrap().iter().zip(&localized) {
+        let apart = written.translation.vector - localized.translation.vector;
+        assert!(apart.norm() < 1e-3, "{written} {localized}");
+    }
+    let rows = |folder: &str| {
+        let text = recording.bytes(&format!("{folder}/mcl_tum.txt"));
+        String::from_utf8(text).unwrap().lines().count()
+    };
+    assert_eq!(rows("live"), rows("results"));
+    assert!(recording.path("live/report.html").exists());
+}
+
+#[test]
+fn damaged_clouds_a_stall_and_a_proposed_pose_are_survived_and_reported() {
+    let recording = street();
+    let Some(outcome) = robot(&recording, "events", &[]) else {
+        return;
+    };
+    let (received, report) = (&outcome["received"], &outcome["report"]);
+    let counts = ["received", "rejected"].map(|key| report["live"][key].as_u64());
+    assert!(counts[0] == Some(11) && counts[1] >= Some(2), "{report}");
+    let stderr = outcome["stderr"].as_str().unwrap();
+    assert_eq!(
+        stderr.matches("a message of /points is left out").count(),
+        1,
+        "{stderr}"
+    );
+    let expected = [
+        "tracking: the scan agrees with the map",
+        "lost: no scan arrived for too long",
+        "tracking: the scan agrees with the map",
+        "searching: a pose was proposed that no scan has confirmed yet",
+        "tracking: the scan agrees with the map",
+    ];
+    assert!(
+        states_include(received, &expected),
+        "{}",
+        received["/diagnostics"]
+    );
+    let (_, last) = *positions(&received["/fpmcl/pose"]).last().unwrap();
+    assert!(distance_m(last, [5.5, 0.0, last[2]]) < 0.1, "{last:?}");
+}
+
+#[test]
+fn with_wheels_poses_are_those_of_the_base_and_the_transform_is_that_of_its_odometry_alone() {
+    let recording = street();
+    let Some(outcome) = robot(&recording, "wheels", &["--odometry=/odom"]) else {
+        return;
+    };
+    let received = &outcome["received"];
+    let poses = positions(&received["/fpmcl/pose"]);
+    assert_eq!(poses.len(), 12);
+    for (frame, [x, y, _]) in poses {
+        // One metre behind the lidar.
+        let error_m = (x - (0.5 * frame as f64 - 1.0)).hypot(y);
+        assert!(error_m < 0.1, "{frame} {x} {y}");
+    }
+    assert_eq!(received["/fpmcl/odometry"][0]["child"], "base_link");
+    let transforms = received["/tf"].as_array().unwrap();
+    let of_program = transforms
+        .iter()
+        .flat_map(|it| it.as_array().unwrap())
+        .filter(|it| it["parent"] == "map");
+    let of_program: Vec<&Value> = of_program.collect();
+    assert_eq!(of_program.len(), 12, "{transforms:?}");
+    for transform in of_program {
+        assert_eq!(transform["child"], "odom");
+        let (_, [x, y, _]) = positions(&json!([transform]))[0];
+        assert!((x + 3.0).hypot(y) < 0.1, "{transform}");
+    }
+    assert_eq!(outcome["report"]["about"]["odometry"], "/odom");
+    // The motion is that of the wheels, not that of the scans, which is not exact.
+    let written = LocalizationResults::read(&recording.path("live/localization.npz")).unwrap();
+    for increment in &written.odometry.unwrap()[1..] {
+        let exact = increment.translation.x - 0.5;
+        assert!(exact.abs() < 1e-6, "{increment}");
+    }
+}
+
+#[test]
+fn what_a_robot_cannot_have_is_an_error_before_any_work() {
+    let recording = Recording::street(1);
+    let live = || {
+        let call = common::fpmcl("live").in_folder(recording.folder());
+        call.with("localization.yml").with("--ros2=points")
+    };
+    live().fails_with(&["pose_file is poses.txt", "set pose_file to null"]);
+    let live = || {
+        let call = live().set("pose_file", "null").set("pose_tracking", "null");
+        call.set("odometry", "auto")
+    };
+    live()
+        .with("--odometry=wheels.txt")
+        .fails_with(&["odometry_file is wheels.txt", "such as /odom"]);
+    live()
+        .with("--replay=velodyne")
+        .rejects_usage_with(&["cannot be used with"]);
+    live()
+        .with("--rate=2")
+        .rejects_usage_with(&["cannot be used with"]);
+    live().with("--domain=300").rejects_usage_with(&["0..=232"]);
+    live()
+        .with("--remap=/a")
+        .rejects_usage_with(&["/fpmcl/pose:=/pose"]);
+}

@@ -1,0 +1,403 @@
+"""A robot for `fpmcl live --ros2`: one process plays clouds, another receives what the program publishes, by Cyclone DDS.
+
+usage: robot.py play FOLDER SCENARIO -- PROGRAM ARGUMENTS...     runs the program on scans of FOLDER, and prints JSON
+       robot.py receive                                          prints what is received, a line each
+
+It runs only where the loopback is the only network interface, because DDS announces itself on every one.
+"""
+
+import json
+import pathlib
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, byte, float64, int32, sequence, uint8, uint32
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+
+def ros(package, name):
+    return {"typename": f"{package}.msg.dds_.{name}_"}
+
+
+@dataclass
+class Time(IdlStruct, **ros("builtin_interfaces", "Time")):
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Header(IdlStruct, **ros("std_msgs", "Header")):
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class PointField(IdlStruct, **ros("sensor_msgs", "PointField")):
+    name: str
+    offset: uint32
+    datatype: uint8
+    count: uint32
+
+
+@dataclass
+class PointCloud2(IdlStruct, **ros("sensor_msgs", "PointCloud2")):
+    header: Header
+    height: uint32
+    width: uint32
+    fields: sequence[PointField]
+    is_bigendian: bool
+    point_step: uint32
+    row_step: uint32
+    data: sequence[uint8]
+    is_dense: bool
+
+
+@dataclass
+class Garbage(IdlStruct, **ros("sensor_msgs", "PointCloud2")):
+    data: sequence[uint8]
+
+
+@dataclass
+class Vector3(IdlStruct, **ros("geometry_msgs", "Vector3")):
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+class Quaternion(IdlStruct, **ros("geometry_msgs", "Quaternion")):
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+
+@dataclass
+class Pose(IdlStruct, **ros("geometry_msgs", "Pose")):
+    position: Vector3
+    orientation: Quaternion
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, **ros("geometry_msgs", "PoseWithCovariance")):
+    pose: Pose
+    covariance: array[float64, 36]
+
+
+@dataclass
+class PoseWithCovarianceStamped(IdlStruct, **ros("geometry_msgs", "PoseWithCovarianceStamped")):
+    header: Header
+    pose: PoseWithCovariance
+
+
+@dataclass
+class Twist(IdlStruct, **ros("geometry_msgs", "Twist")):
+    linear: Vector3
+    angular: Vector3
+
+
+@dataclass
+class TwistWithCovariance(IdlStruct, **ros("geometry_msgs", "TwistWithCovariance")):
+    twist: Twist
+    covariance: array[float64, 36]
+
+
+@dataclass
+class Odometry(IdlStruct, **ros("nav_msgs", "Odometry")):
+    header: Header
+    child_frame_id: str
+    pose: PoseWithCovariance
+    twist: TwistWithCovariance
+
+
+@dataclass
+class TransformStamped(IdlStruct, **ros("geometry_msgs", "TransformStamped")):
+    header: Header
+    child_frame_id: str
+    transform: Pose
+
+
+@dataclass
+class TFMessage(IdlStruct, **ros("tf2_msgs", "TFMessage")):
+    transforms: sequence[TransformStamped]
+
+
+@dataclass
+class KeyValue(IdlStruct, **ros("diagnostic_msgs", "KeyValue")):
+    key: str
+    value: str
+
+
+@dataclass
+class DiagnosticStatus(IdlStruct, **ros("diagnostic_msgs", "DiagnosticStatus")):
+    level: byte
+    name: str
+    message: str
+    hardware_id: str
+    values: sequence[KeyValue]
+
+
+@dataclass
+class DiagnosticArray(IdlStruct, **ros("diagnostic_msgs", "DiagnosticArray")):
+    header: Header
+    status: sequence[DiagnosticStatus]
+
+
+RELIABLE = Policy.Reliability.Reliable(duration(seconds=1))
+LATCHED = Qos(RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
+# Those of subscriptions of ROS 2.
+USUAL = Qos(RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(1000))
+# That of drivers of sensors.
+OF_SENSORS = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
+
+
+def writer(participant, topic, message, qos):
+    return DataWriter(participant, Topic(participant, "rt" + topic, message, qos=qos), qos=qos)
+
+
+def reader(participant, topic, message, qos):
+    return DataReader(participant, Topic(participant, "rt" + topic, message, qos=qos), qos=qos)
+
+
+def stamp(time_ns):
+    return Time(time_ns // 10**9, time_ns % 10**9)
+
+
+def numbers(pose):
+    return [*vars(pose.position).values(), *vars(pose.orientation).values()]
+
+
+def described(topic, message):
+    """What the test looks at."""
+    if topic == "/tf":
+        return [
+            {
+                "parent": it.header.frame_id,
+                "child": it.child_frame_id,
+                "stamp_ns": it.header.stamp.sec * 10**9 + it.header.stamp.nanosec,
+                "pose": numbers(it.transform),
+            }
+            for it in message.transforms
+        ]
+    if topic == "/diagnostics":
+        status = message.status[0]
+        values = {it.key: it.value for it in status.values}
+        return {"level": status.level, "name": status.name, "message": status.message, "values": values}
+    header = {
+        "frame": message.header.frame_id,
+        "stamp_ns": message.header.stamp.sec * 10**9 + message.header.stamp.nanosec,
+    }
+    if topic == "/fpmcl/map":
+        return header | {"points": message.width, "bytes": len(message.data)}
+    found = header | {"pose": numbers(message.pose.pose), "covariance": list(message.pose.covariance)}
+    if topic == "/fpmcl/odometry":
+        twist = message.twist.twist
+        return found | {"child": message.child_frame_id, "forward_m_per_s": twist.linear.x, "turn_rad_per_s": twist.angular.z}
+    return found
+
+
+def receive():
+    participant = DomainParticipant(0)
+    readers = {
+        "/fpmcl/pose": reader(participant, "/fpmcl/pose", PoseWithCovarianceStamped, USUAL),
+        "/fpmcl/odometry": reader(participant, "/fpmcl/odometry", Odometry, USUAL),
+        "/tf": reader(participant, "/tf", TFMessage, USUAL),
+        "/diagnostics": reader(participant, "/diagnostics", DiagnosticArray, USUAL),
+        "/fpmcl/map": reader(participant, "/fpmcl/map", PointCloud2, LATCHED),
+    }
+    while True:
+        for topic, of_topic in readers.items():
+            # At its end the program takes back what it said: samples without data.
+            for message in filter(lambda it: it.sample_info.valid_data, of_topic.take(100)):
+                print(json.dumps([topic, described(topic, message)]), flush=True)
+        matched = sum(bool(it.get_matched_publications()) for it in readers.values())
+        print(json.dumps(["matched", matched]), flush=True)
+        time.sleep(0.02)
+
+
+class Receiver:
+    """What the other process receives."""
+
+    def __init__(self):
+        command = [sys.executable, __file__, "receive"]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self.messages = {}
+        self.matched = 0
+        threading.Thread(target=self.read, daemon=True).start()
+
+    def read(self):
+        for line in self.process.stdout:
+            topic, message = json.loads(line)
+            if topic == "matched":
+                self.matched = message
+            else:
+                self.messages.setdefault(topic, []).append(message)
+
+    def of(self, topic):
+        return self.messages.get(topic, [])
+
+    def wait(self, what, is_there, seconds=120):
+        """Waits until something is received."""
+        end = time.monotonic() + seconds
+        while not is_there():
+            if time.monotonic() > end:
+                states = [it["message"] for it in self.of("/diagnostics")]
+                sys.exit(f"not received in {seconds} s: {what}; states {states[-5:]}")
+            time.sleep(0.01)
+
+    def wait_for_state(self, words, after=0):
+        self.wait(words, lambda: any(words in it["message"] for it in self.of("/diagnostics")[after:]))
+        return len(self.of("/diagnostics"))
+
+    def has_pose(self, time_ns):
+        return any(it["stamp_ns"] == time_ns for it in self.of("/fpmcl/pose"))
+
+
+class Robot:
+    """Plays the scans of a folder: frame k at k tenths of a second after the first."""
+
+    PERIOD_NS = 10**8
+
+    def __init__(self, folder, receiver):
+        self.scans = sorted(pathlib.Path(folder).glob("*.bin"))
+        self.receiver = receiver
+        self.participant = DomainParticipant(0)
+        self.clouds = writer(self.participant, "/points", PointCloud2, OF_SENSORS)
+        self.proposals = writer(self.participant, "/initialpose", PoseWithCovarianceStamped, USUAL)
+        # Transforms, and the odometry.
+        self.transforms = writer(self.participant, "/tf", TFMessage, USUAL)
+        self.static = writer(self.participant, "/tf_static", TFMessage, LATCHED)
+        self.odometry = writer(self.participant, "/odom", Odometry, USUAL)
+        receiver.wait("the topics of the program", lambda: receiver.matched == 5)
+        receiver.wait("the reader of clouds", self.clouds.get_matched_subscriptions)
+        receiver.wait("the reader of proposals", self.proposals.get_matched_subscriptions)
+
+    def moment(self, frame, later_ns=0):
+        return 10**9 + self.PERIOD_NS * frame + later_ns
+
+    def cloud(self, frame, later_ns=0, cut=0):
+        """Sends a scan; of which the last bytes are missing."""
+        data = self.scans[frame].read_bytes()
+        fields = [PointField(name, 4 * k, 7, 1) for k, name in enumerate(["x", "y", "z", "intensity"])]
+        count = len(data) // 16
+        header = Header(stamp(self.moment(frame, later_ns)), "lidar")
+        data = data[: len(data) - cut]
+        self.clouds.write(PointCloud2(header, 1, count, fields, False, 16, 16 * count, data, True))
+
+    def drive(self, frames, later_ns=0):
+        """Sends scans at their pace, and waits for the pose of the last."""
+        for frame in frames:
+            began = time.monotonic()
+            self.before(frame)
+            self.cloud(frame, later_ns)
+            time.sleep(max(0.0, 0.1 - (time.monotonic() - began)))
+        last = self.moment(frames[-1], later_ns)
+        self.receiver.wait(f"the pose of frame {frames[-1]}", lambda: self.receiver.has_pose(last))
+
+    def before(self, frame):
+        """What else is sent before a scan."""
+
+    def pose(self, x, y=0.0):
+        return Pose(Vector3(x, y, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
+
+
+class Wheeled(Robot):
+    """Its lidar is 1 m ahead of the base, whose odometry drifts sideways from (3, 0)."""
+
+    def odom_x(self, frame):
+        return 3.0 + 0.5 * frame - 1.0
+
+    def place(self):
+        mounting = TransformStamped(Header(stamp(0), "base_link"), "lidar", self.pose(1.0))
+        self.static.write(TFMessage([mounting]))
+        self.receiver.wait("the reader of transforms", self.transforms.get_matched_subscriptions)
+
+    def before(self, frame):
+        # At the moment of the scan, and half a period later: that of the scan is known when it is received.
+        for half in range(2):
+            header = Header(stamp(self.moment(frame, half * self.PERIOD_NS // 2)), "odom")
+            pose = self.pose(self.odom_x(frame + 0.5 * half))
+            self.transforms.write(TFMessage([TransformStamped(header, "base_link", pose)]))
+            with_covariance = PoseWithCovariance(pose, [0.0] * 36)
+            still = TwistWithCovariance(Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), [0.0] * 36)
+            self.odometry.write(Odometry(header, "base_link", with_covariance, still))
+
+
+def drive(folder, receiver):
+    robot = Robot(folder, receiver)
+    robot.drive(range(12))
+
+
+def events(folder, receiver):
+    """A damaged cloud, one that is none, a stall, and a pose that is proposed."""
+    robot = Robot(folder, receiver)
+    robot.drive(range(5))
+    robot.cloud(5, cut=1000)
+    stranger = DomainParticipant(0)
+    garbage = writer(stranger, "/points", Garbage, OF_SENSORS)
+    receiver.wait("the reader of garbage", garbage.get_matched_subscriptions)
+    # Which of them is the first that the program takes, depends on when it has discovered this writer, too.
+    for _ in range(20):
+        garbage.write(Garbage(bytes([255]) * 1000))
+        time.sleep(0.1)
+    seen = receiver.wait_for_state("lost: no scan arrived for too long")
+    later_ns = 2 * 10**9
+    robot.drive(range(6, 9), later_ns)
+    seen = receiver.wait_for_state("tracking: ", seen)
+    covariance = [0.0] * 36
+    covariance[0] = covariance[7] = 0.25
+    covariance[35] = 0.07
+    header = Header(stamp(robot.moment(8, later_ns)), "map")
+    proposal = PoseWithCovariance(robot.pose(4.3, 0.2), covariance)
+    robot.proposals.write(PoseWithCovarianceStamped(header, proposal))
+    seen = receiver.wait_for_state("searching: a pose was proposed", seen)
+    # Frames without a confirmed pose have none.
+    for frame in (9, 10):
+        robot.cloud(frame, later_ns)
+        time.sleep(0.1)
+    robot.drive([11], later_ns)
+
+
+def wheels(folder, receiver):
+    robot = Wheeled(folder, receiver)
+    robot.place()
+    robot.drive(range(12))
+
+
+def play(folder, scenario, command):
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    receiver = Receiver()
+    try:
+        scenario(folder, receiver)
+        program.send_signal(signal.SIGTERM)
+        stdout, stderr = program.communicate(timeout=120)
+    finally:
+        program.kill()
+        receiver.process.kill()
+    if program.returncode != 0:
+        sys.exit(f"the program ends with {program.returncode}: {stderr}")
+    print(json.dumps({"received": receiver.messages, "report": json.loads(stdout), "stderr": stderr}))
+
+
+def has_loopback_alone():
+    links = subprocess.run(["ip", "-o", "link", "show", "up"], capture_output=True, text=True, check=True).stdout
+    return [line.split()[1] for line in links.splitlines()] == ["lo:"]
+
+
+if __name__ == "__main__":
+    if not has_loopback_alone():
+        sys.exit("the loopback must be the only network interface")
+    if sys.argv[1] == "receive":
+        receive()
+    folder, scenario = sys.argv[2:4]
+    play(folder, {"drive": drive, "events": events, "wheels": wheels}[scenario], sys.argv[5:])
