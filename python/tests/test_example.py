@@ -1,6 +1,7 @@
-"""The example runs, and finds the car."""
+"""The examples run, and find the car."""
 
 import os
+import py_compile
 import re
 import subprocess
 import sys
@@ -19,6 +20,11 @@ def run(*arguments):
 
 def test_without_data_the_example_says_so(tmp_path):
     assert run(tmp_path / "none") == f"skipped: {tmp_path / 'none'} does not exist\n"
+
+
+def test_the_node_of_ros_2_is_python(tmp_path):
+    # Without ROS it cannot run.
+    py_compile.compile(str(EXAMPLE.with_name("ros2_node.py")), doraise=True, cfile=str(tmp_path / "node.pyc"))
 
 
 def test_the_scene_is_localized_to_centimetres(tmp_path):
