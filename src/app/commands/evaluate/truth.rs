@@ -173,28 +173,38 @@ fn poses_by_number(
         .collect())
 }
 
-/// Aligns the estimates and the refined trajectory with the truth, each by a transform of its own.
+/// Aligns the estimates and the refined trajectory with the truth, each by a transform of its own, which its trusted poses
+/// determine.
 pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<()> {
     if alignment == Alignment::None {
         return Ok(());
     }
     let truth = results.ground_truth.clone().unwrap_or_default();
     let truth_in_space = results.ground_truth_in_space.clone();
-    for (poses, in_space, trajectory) in [
+    let [of_filter, of_refined] = [results.trusted(), results.refined_trusted()];
+    for (trusted, poses, in_space, trajectory) in [
         (
+            of_filter,
             &mut results.estimates,
             &mut results.estimates_in_space,
             &mut results.trajectory_in_space,
         ),
         (
+            of_refined,
             &mut results.refined,
             &mut results.refined_in_space,
             &mut None,
         ),
     ] {
-        let transform = match (&*in_space, &truth_in_space, &*poses) {
-            (Some(estimates), Some(truth), _) => alignment.transform(estimates, truth),
-            (_, _, Some(estimates)) => alignment.transform(&level(estimates), &level(&truth)),
+        let transform = |estimates: &[Pose3], truth: &[Pose3]| {
+            let [estimates, truth] = [estimates, truth].map(|poses| select(poses, &trusted));
+            alignment.transform(&estimates, &truth)
+        };
+        // Where frames were filled back, the trajectory has their poses.
+        let best = trajectory.as_ref().or(in_space.as_ref());
+        let transform = match (best, &truth_in_space, &*poses) {
+            (Some(estimates), Some(truth), _) => transform(estimates, truth),
+            (_, _, Some(estimates)) => transform(&level(estimates), &level(&truth)),
             _ => continue,
         };
         let transform = transform.context(
@@ -217,8 +227,54 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
     Ok(())
 }
 
+/// The trusted poses; all, if none is.
+fn select(poses: &[Pose3], trusted: &[bool]) -> Vec<Pose3> {
+    let chosen = poses.iter().zip(trusted);
+    let chosen: Vec<Pose3> = chosen.filter(|it| *it.1).map(|it| *it.0).collect();
+    if chosen.is_empty() {
+        poses.to_vec()
+    } else {
+        chosen
+    }
+}
+
 fn level(poses: &[Pose2]) -> Vec<Pose3> {
     (poses.iter())
         .map(|pose| pose3_from_pose2(pose, 0.0))
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+
+    use super::*;
+    use crate::localization::State;
+
+    #[test]
+    fn poses_that_are_not_trusted_do_not_determine_the_alignment() {
+        let [searching, tracking] = [State::Searching, State::Tracking].map(|it| it as u8);
+        let truth: Vec<Pose2> = (0..20)
+            .map(|k| Pose2::new([f64::from(k), (0.1 * f64::from(k)).sin()].into(), 0.1))
+            .collect();
+        let estimate_from_truth = Pose2::new([5.0, -3.0].into(), 0.4);
+        let mut estimates: Vec<Pose2> = truth.iter().map(|it| estimate_from_truth * it).collect();
+        estimates[0] = Pose2::new([-70.0, 40.0].into(), 2.0);
+        let mut states = vec![tracking; 20];
+        states[0] = searching;
+        for alignment in [Alignment::First, Alignment::Rigid] {
+            let mut results = LocalizationResults {
+                frames: (0..20).collect(),
+                estimates: Some(estimates.clone()),
+                ground_truth: Some(truth.clone()),
+                states: Some(states.clone()),
+                ..LocalizationResults::default()
+            };
+            align(&mut results, alignment).unwrap();
+            let found = results.estimates.unwrap();
+            for (found, truth) in found.iter().zip(&truth).skip(1) {
+                assert_relative_eq!(found, truth, epsilon = 1e-9);
+            }
+        }
+    }
 }
