@@ -207,7 +207,7 @@ fn a_rough_trajectory_comes_to_centimetres_and_one_from_elsewhere_is_marked() {
 
     // From where the uncertainty does not reach the truth, nothing is claimed.
     write_rough_poses(&folder.join("far.txt"), &truth, [400.0, 0.0], 0.0);
-    let far = refine("far.txt").with("--output=far/r.npz");
+    let far = refine("far.txt").with("--output=far/r");
     let output = far.set("all_poses", "True").exits_with(3);
     assert!(
         output.stderr.contains("14 of 14 poses"),
@@ -215,6 +215,8 @@ fn a_rough_trajectory_comes_to_centimetres_and_one_from_elsewhere_is_marked() {
         output.stderr
     );
     assert!((error_m("far", 5) - 400.0).abs() < 1e-3);
+    // A result without the ending is one.
+    refine("far/r").fails_with(&["far/r already has refined poses", "--force"]);
     let report = json(&folder.join("far/report.json"));
     assert_eq!(report["summary"]["tracking"], 0);
 }

@@ -19,7 +19,7 @@ use crate::app::report::plotting::color::{Colormap, TRUTH};
 use crate::app::report::results::stretches;
 use crate::app::report::{LocalizationResults, run_output};
 use crate::app::run::{Claims, Context, Outputs, Printed, input, output};
-use crate::app::settings::RefinementConfig;
+use crate::app::settings::{self, RefinementConfig};
 use crate::evaluation::planar_errors;
 use crate::geometry::{Pose3, TriangleMesh, pose2_from_pose3};
 use crate::map::files::mesh_file;
@@ -51,14 +51,10 @@ struct WrittenFile {
 pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
     input::require_file("the input", &args.input)?;
     let claims = check(args, context)?;
-    let is_map = !args
-        .input
-        .extension()
-        .is_some_and(|it| it.eq_ignore_ascii_case("npz"));
-    let tiles = if is_map {
-        export_map(args, context)?
-    } else {
+    let tiles = if settings::is_result(&args.input) {
         export_result(args, context)?
+    } else {
+        export_map(args, context)?
     };
     let mut files = Vec::new();
     for (mut claims, path) in claims {

@@ -11,8 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::app::report::results::Value;
 use crate::app::report::{LocalizationResults, RunSummary};
 use crate::app::run::arguments::setting;
-use crate::app::run::input::is_bag;
-use crate::app::run::{MachineArgs, Printed, gibibytes};
+use crate::app::run::{MachineArgs, Printed, gibibytes, input};
 use crate::app::settings;
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Aabb;
@@ -80,16 +79,19 @@ pub fn run(args: &InfoArgs) -> Result<Printed> {
     if args.clear_cache {
         clear_cache(path)?;
     }
-    let extension = path.extension().and_then(|extension| extension.to_str());
-    match extension {
-        _ if path.is_dir() || is_bag(path) => recording(path, config.topic.as_deref()),
-        Some("npz") => result(path),
-        _ if scan_files::is_mesh(path) => map(path),
-        _ if scan_files::is_scan(path) => cloud(path),
-        _ => bail!(
+    if path.is_dir() || input::is_bag(path) {
+        recording(path, config.topic.as_deref())
+    } else if settings::is_result(path) {
+        result(path)
+    } else if scan_files::is_mesh(path) {
+        map(path)
+    } else if scan_files::is_scan(path) {
+        cloud(path)
+    } else {
+        bail!(
             "{} is neither a recording (a folder, .mcap, .db3 or .bag) nor a scan or point cloud (.bin, .pcd, .ply, .npy) nor a map (.ply) nor a result (.npz)",
             path.display()
-        ),
+        )
     }
 }
 

@@ -14,9 +14,9 @@ use super::stages::{RecordingInputs, input_files};
 use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, Trajectory};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
 use crate::app::run::arguments::numbers;
-use crate::app::run::{Claims, Context, NPZ, Outputs, RunArgs, input, output};
+use crate::app::run::{Claims, Context, Outputs, RunArgs, input, output};
 use crate::app::settings::{
-    self, LocalizationConfig, OdometrySource, OutputConfig, RefinementConfig,
+    self, LocalizationConfig, NPZ, OdometrySource, OutputConfig, RefinementConfig,
 };
 use crate::evaluation::RangeMclRules;
 use crate::files::remove_abandoned;

@@ -15,7 +15,7 @@ pub mod version;
 pub mod visible;
 
 pub use arguments::{ConfigArgs, RunArgs};
-pub use artefact::{CLAIMS_FILE, Claims, Lock, NPZ, Outputs, PLY};
+pub use artefact::{CLAIMS_FILE, Claims, Lock, Outputs, PLY};
 pub use context::{Context, MachineArgs, gibibytes};
 pub use interrupt::{Interrupt, Interrupted};
 pub use output::{Form, Printed};

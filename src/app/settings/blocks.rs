@@ -1,5 +1,7 @@
 //! Blocks of keys that several commands share.
 
+use std::fs::File;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use schemars::JsonSchema;
@@ -153,6 +155,21 @@ pub struct OutputConfig {
     pub plots: bool,
     /// Whether to replace existing output.
     pub force: bool,
+}
+
+/// First bytes of a result.
+pub const NPZ: &[u8] = b"PK";
+
+/// Whether a file is a result of `localize` or `refine`, an archive of arrays, and not a trajectory as text: by its name, or
+/// by how it begins.
+pub fn is_result(path: &Path) -> bool {
+    let begins_as_archive = || {
+        let mut start = [0; NPZ.len()];
+        let read = File::open(path).and_then(|mut file| file.read_exact(&mut start));
+        read.is_ok() && start == NPZ
+    };
+    let extension = path.extension();
+    extension.is_some_and(|it| it.eq_ignore_ascii_case("npz")) || begins_as_archive()
 }
 
 /// Requires a path that is not empty.

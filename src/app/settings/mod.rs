@@ -22,8 +22,8 @@ mod load;
 mod tests;
 
 pub use blocks::{
-    MapInputConfig, MotionSourceConfig, OdometrySource, OutputConfig, PoseInputConfig,
-    RecordingConfig, require_path,
+    MapInputConfig, MotionSourceConfig, NPZ, OdometrySource, OutputConfig, PoseInputConfig,
+    RecordingConfig, is_result, require_path,
 };
 pub use build_map::BuildMapConfig;
 pub use evaluation::EvaluationConfig;

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{
-    MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig, RecordingConfig,
+    MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig, RecordingConfig, is_result,
     optional_path, require_path,
 };
 use super::localization::LocalizationConfig;
@@ -77,9 +77,7 @@ impl RefinementConfig {
 
     /// Whether a trajectory is refined, and not a result of `localize`.
     pub fn is_trajectory(&self) -> bool {
-        self.result_file
-            .extension()
-            .is_none_or(|extension| extension != "npz")
+        !is_result(&self.result_file)
     }
 
     /// The result that is written.

@@ -4,17 +4,15 @@ mod trajectory;
 mod truth;
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Result, ensure};
 use clap::Args;
 use serde::Serialize;
 
 use crate::app::report::run_output::{self, REPORT_FILES};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
-use crate::app::run::{Claims, Context, NPZ, Outputs, RunArgs, input, output};
+use crate::app::run::{Claims, Context, Outputs, RunArgs, input, output};
 use crate::app::settings::{self, EvaluationConfig, LocalizationConfig};
 use crate::evaluation::alignment::level_camera_axes;
 use crate::evaluation::{Alignment, RangeMclRules};
@@ -167,24 +165,12 @@ fn note(about: &mut BTreeMap<String, String>, alignment: Alignment) {
     about.insert("alignment".to_owned(), text.to_owned());
 }
 
-/// Whether a file is an archive of arrays; otherwise it is a trajectory as text.
-fn is_archive(path: &Path) -> Result<bool> {
-    let mut start = Vec::new();
-    File::open(path)
-        .and_then(|file| file.take(NPZ.len() as u64).read_to_end(&mut start))
-        .with_context(|| format!("cannot read {}", path.display()))?;
-    let is_named = path
-        .extension()
-        .is_some_and(|it| it.eq_ignore_ascii_case("npz"));
-    Ok(is_named || start == NPZ)
-}
-
 /// The outputs: by default next to a result, and in a folder of its own next to a trajectory.
 fn output_files(config: &EvaluationConfig) -> Result<RunFiles> {
     let result = &config.result_file;
     Ok(match &config.output_folder {
         Some(folder) => RunFiles::in_folder(result, folder),
-        None if is_archive(result)? => RunFiles::new(result),
+        None if settings::is_result(result) => RunFiles::new(result),
         None => {
             let stem = result.file_stem().unwrap_or_default().to_string_lossy();
             let folder = folder_of(result).join(format!("{stem}_evaluation"));
@@ -200,7 +186,7 @@ fn read(config: &EvaluationConfig) -> Result<LocalizationResults> {
     if let Some(path) = calibration {
         input::require_file("result_calib_file", path)?;
     }
-    let mut results = if is_archive(path)? {
+    let mut results = if settings::is_result(path) {
         LocalizationResults::read(path)?
     } else {
         trajectory::read(path, calibration)?
@@ -242,7 +228,7 @@ fn prepare(config: &EvaluationConfig, context: &Context, main: &Path) -> Result<
 /// The inputs and settings of the run from its report, and the evaluated files.
 fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
     let report = RunFiles::new(&config.result_file).file("report.json");
-    let mut about = if is_archive(&config.result_file)? && report.exists() {
+    let mut about = if settings::is_result(&config.result_file) && report.exists() {
         Report::read_json(&report)?.about
     } else {
         BTreeMap::new()

@@ -31,8 +31,6 @@ pub const CONFIGURATION_FILE: &str = "the configuration file";
 
 /// First bytes of a map.
 pub const PLY: &[u8] = b"ply";
-/// First bytes of a result.
-pub const NPZ: &[u8] = b"PK";
 
 /// Outputs of a run, all in one folder.
 pub struct Outputs<'a> {

@@ -25,7 +25,7 @@ use std::time::Instant;
 use anyhow::{Context as _, Result};
 use serde::{Deserialize, Serialize};
 
-pub use self::claims::{CLAIMS_FILE, CONFIGURATION_FILE, Claims, NPZ, Outputs, PLY};
+pub use self::claims::{CLAIMS_FILE, CONFIGURATION_FILE, Claims, Outputs, PLY};
 pub use self::lock::Lock;
 use crate::app::run::output;
 
