@@ -112,18 +112,27 @@ impl Task {
         self.bar.set_message(visible_in_line(text).into_owned());
     }
 
-    /// Writes a line if enough time has passed since the last one; only one of many threads does.
+    /// Writes a line if enough time has passed since the last one.
     fn write_line_if_due(&self) {
-        let Some(last_line_ms) = &self.last_line_ms else {
-            return;
+        if self.is_line_due(self.bar.elapsed()) {
+            self.write_line();
+        }
+    }
+
+    /// Whether a line is due some time after the start, to only one of many threads; that of the end follows it.
+    fn is_line_due(&self, elapsed: Duration) -> bool {
+        let Some(last_line_ms) = self.last_line_ms.as_ref().filter(|_| !self.is_complete()) else {
+            return false;
         };
-        let (relaxed, now_ms) = (Ordering::Relaxed, self.bar.elapsed().as_millis() as u64);
+        let (relaxed, now_ms) = (Ordering::Relaxed, elapsed.as_millis() as u64);
         let last_ms = last_line_ms.load(relaxed);
         let is_due = now_ms >= last_ms + LINE_INTERVAL.as_millis() as u64;
         let changed = || last_line_ms.compare_exchange(last_ms, now_ms, relaxed, relaxed);
-        if is_due && changed().is_ok() {
-            self.write_line();
-        }
+        is_due && changed().is_ok()
+    }
+
+    fn is_complete(&self) -> bool {
+        Some(self.bar.position()) >= self.bar.length()
     }
 
     fn write_line(&self) {
@@ -140,7 +149,7 @@ impl Drop for Task {
         if self.last_line_ms.is_some() {
             self.write_line();
         }
-        if Some(self.bar.position()) >= self.bar.length() {
+        if self.is_complete() {
             self.bar.finish();
         } else {
             self.bar.abandon();
@@ -209,6 +218,15 @@ mod tests {
             line("localize", 0, 160, Duration::ZERO),
             "localize: 0 of 160 (0 %), 0.0/s, time left unknown"
         );
+    }
+
+    #[test]
+    fn a_line_is_due_every_few_seconds_until_the_end_which_has_its_own() {
+        let task = Progress::Lines.task("count", 2);
+        let due = |elapsed_s: u64| task.is_line_due(Duration::from_secs(elapsed_s));
+        assert_eq!([4, 5, 9, 10].map(due), [false, true, false, true]);
+        task.advance(2);
+        assert!(!due(20));
     }
 
     #[test]
