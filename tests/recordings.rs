@@ -280,10 +280,16 @@ fn info_has_the_period_of_the_sensor_and_where_the_times_are_from() {
     assert_eq!(found["times_from"], "./times.txt");
     assert!(text.contains("in ./times.txt"), "{text}");
 
+    // One folder up.
+    fs::rename(recording.path("velodyne"), recording.path("plain")).unwrap();
+    let (found, said, _) = info("plain");
+    assert_eq!(found["times_from"], "times.txt");
+    assert!(said.contains("those of times.txt"), "{said}");
+
     fs::create_dir(recording.path("named")).unwrap();
     for frame in 0..FRAMES {
         let name = format!("named/{:.2}.bin", 1_700_000_000.0 + 0.05 * frame as f64);
-        let scan = recording.path(&format!("velodyne/{frame:06}.bin"));
+        let scan = recording.path(&format!("plain/{frame:06}.bin"));
         fs::rename(scan, recording.path(&name)).unwrap();
     }
     let (found, said, text) = info("named");

@@ -87,7 +87,10 @@ impl RecordingFiles {
         let poses = || existing(base, &["poses.txt", "poses_tum.txt", "poses.tum"]);
         let calibration = existing(base, &["calib.txt"]);
         let times = existing(base, &["times.txt"]);
-        let times_above = existing(&base.join(".."), &["times.txt"]);
+        // The name of a folder is enough for the one above it; of `.` and `..` it is not.
+        let above =
+            (base.file_name().and(base.parent())).map_or_else(|| base.join(".."), Path::to_owned);
+        let times_above = existing(&above, &["times.txt"]);
         if base.join("velodyne_points/data").is_dir() {
             return Self {
                 layout: Layout::KittiRaw,
