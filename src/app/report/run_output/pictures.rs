@@ -217,7 +217,7 @@ impl<'a> Drawing<'a> {
         )
     }
 
-    /// Draws how sure the run was of each frame: the standard deviation, and the agreement by state.
+    /// Draws how sure the run was of each frame, by state: the standard deviation, and the agreement where it is known.
     fn states(&self) -> Result<()> {
         let (Some(states), Some(covariances)) = (&self.results.states, &self.results.covariances)
         else {
@@ -226,27 +226,28 @@ impl<'a> Drawing<'a> {
         let (x_name, x) = time_axis(self.results);
         let axes = covariances.iter().zip(&self.estimates);
         let sigmas_cm = axes.map(|(covariance, pose)| 100.0 * Axes::new(covariance, pose).long_m);
-        let sigma = Series::line(
-            "of the position, MCL",
-            MCL,
-            x.iter().copied().zip(sigmas_cm),
-        );
-        let agreements = self.results.agreements.as_deref().unwrap_or_default();
-        let by_state = STATES.into_iter().map(|(state, color)| {
-            let rows = (0..agreements.len())
-                .filter(|&row| states[row] == state as u8 && agreements[row] >= 0.0);
-            let points = rows.map(|row| (x[row], 100.0 * agreements[row]));
-            Series {
-                mark: Mark::Dots,
-                ..Series::line(state.word(), color, points)
-            }
-        });
+        let sigmas_cm: Vec<f64> = sigmas_cm.collect();
+        let agreements = self.results.agreements.iter().flatten();
+        let percent = agreements.map(|&it| if it < 0.0 { f64::NAN } else { 100.0 * it });
+        let percent: Vec<f64> = percent.collect();
+        let by_state = |values: &[f64]| -> Vec<Series> {
+            let series = STATES.into_iter().map(|(state, color)| {
+                let rows = x.iter().zip(values).zip(states);
+                let rows = rows.filter(|((_, y), it)| **it == state as u8 && y.is_finite());
+                let points = rows.map(|((&x, &y), _)| (x, y));
+                Series {
+                    mark: Mark::Dots,
+                    ..Series::line(state.word(), color, points)
+                }
+            });
+            series.filter(|it| !it.points.is_empty()).collect()
+        };
         let panels = [
-            Panel::new("standard deviation [cm]", [sigma]),
             Panel::new(
-                "beams on the map [%]",
-                by_state.filter(|it| !it.points.is_empty()),
+                "standard deviation of the position, MCL [cm]",
+                by_state(&sigmas_cm),
             ),
+            Panel::new("beams on the map [%]", by_state(&percent)),
         ];
         self.save(
             &LineChart::new("States over time", x_name, panels),
