@@ -10,7 +10,8 @@
 //!
 //! A place that was found by a search is confirmed by the share of one scan if nearly all of its beams agree, else by
 //! those of several scans in turn: many places agree with a single scan of few beams. A pose that was uncertain in
-//! between, as along a tunnel, is confirmed by a share that is not below the slow average.
+//! between, as along a tunnel, is confirmed by a share that is not below the slow average. Where nothing is compared, nothing is
+//! confirmed.
 //!
 //! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) averages the
 //! likelihood instead; here traffic in front of the map must not raise an alarm, so that beams that
@@ -148,20 +149,18 @@ impl AgreementMonitor {
         follow(&mut self.slow, config.slow_rate);
     }
 
-    /// Whether the place is confirmed to which the filter has converged, or not, in this update. Without a share
-    /// nothing contradicts it.
+    /// Whether the place is confirmed to which the filter has converged, or not, in this update. What is not compared
+    /// confirms nothing.
     pub fn confirm(
         &mut self,
         is_converged: bool,
         agreement: Option<f64>,
         config: &TrackingLossConfig,
     ) -> bool {
-        let agreement = agreement.unwrap_or(config.confirming_agreement);
-        self.confirming = if !is_converged {
-            0
-        } else if agreement >= config.sure_agreement {
+        let share = agreement.filter(|_| is_converged).unwrap_or(0.0);
+        self.confirming = if share >= config.sure_agreement {
             config.confirming_updates
-        } else if agreement >= config.confirming_agreement {
+        } else if share >= config.confirming_agreement {
             self.confirming + 1
         } else {
             0
@@ -178,9 +177,8 @@ impl AgreementMonitor {
     }
 
     /// Whether a share confirms a pose that was uncertain: it is as large as usual here, or nearly all beams agree.
-    /// Without a share nothing contradicts it.
     pub fn is_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
-        agreement.is_none_or(|share| {
+        agreement.is_some_and(|share| {
             share >= config.sure_agreement || self.slow.is_none_or(|slow| share >= slow)
         })
     }
@@ -243,7 +241,7 @@ mod tests {
         assert_eq!(confirmed_after(&[Some(0.75); 4]), Some(2));
         // Places 3 m from the right one agree as well as this.
         assert_eq!(confirmed_after(&[Some(0.6); 9]), None);
-        assert_eq!(confirmed_after(&[None; 4]), Some(2));
+        assert_eq!(confirmed_after(&[None; 9]), None);
         // An update without convergence restarts the count.
         let mut monitor = AgreementMonitor::default();
         for is_converged in [true, true, false, true, true] {

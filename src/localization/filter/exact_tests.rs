@@ -100,19 +100,43 @@ fn a_pose_that_becomes_imprecise_between_updates_is_reported_as_searching() {
         motion: OdometryNoise::constant(1e-3, 1.0, 1e-3),
         ..LocalizerConfig::of_test(3)
     };
-    let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
+    let street = TestWorld::street();
+    let start = street.pose_at(0.0, 0.0, 0.7);
+    let scan = street.scan(&start);
     let mut filter = tracking(config, start, Matrix3::zeros());
     let mut rng = StdRng::seed_from_u64(1);
     let creep = Odometry::Increment(Pose2::translation(3e-3, 0.0));
     let states = [0; 4].map(|_| {
         let attitude = SensorAttitude::default();
-        let frame = filter.step(creep, &empty_scan(), &attitude, &mut rng);
+        let frame = filter.step(creep, &scan, &attitude, &mut rng);
         let frame = frame.unwrap();
         assert!(!frame.updated);
         frame.state
     });
     let [tracking, searching] = [State::Tracking, State::Searching];
     assert_eq!(states, [tracking, tracking, searching, searching]);
+}
+
+#[test]
+fn a_standing_car_is_compared_with_the_map_and_is_sure_only_of_what_it_sees() {
+    let street = TestWorld::street();
+    let start = street.pose_at(0.0, 0.0, 0.7);
+    // At the same pose, without returns, and turned while the odometry reports no motion.
+    let seen = |pose: &Pose2| street.scan(pose);
+    let turned = start * Pose2::rotation(0.5);
+    for (scan, is_tracked, is_updated) in [
+        (seen(&start), true, false),
+        (empty_scan(), false, false),
+        (seen(&turned), false, true),
+    ] {
+        let mut filter = tracking(LocalizerConfig::of_test(3), start, Matrix3::zeros());
+        let mut rng = StdRng::seed_from_u64(1);
+        let still = Odometry::Increment(Pose2::identity());
+        let frame = filter.step(still, &scan, &SensorAttitude::default(), &mut rng);
+        let frame = frame.unwrap();
+        let found = (frame.state == State::Tracking, frame.updated);
+        assert_eq!(found, (is_tracked, is_updated));
+    }
 }
 
 #[test]

@@ -573,8 +573,9 @@ fn a_scan_without_returns_leaves_the_prediction() {
         .step(step, &empty, &SensorAttitude::default(), &mut rng)
         .unwrap();
     assert_relative_eq!(frame.pose.translation.x, 8.0, epsilon = 0.1);
+    // Nothing was compared.
     assert_eq!(frame.agreement, None);
-    assert_eq!(frame.state, State::Tracking);
+    assert_eq!(frame.state, State::Searching);
 }
 
 #[test]

@@ -2,14 +2,14 @@
 
 use rand::Rng;
 
-use super::phase::Evidence;
+use super::phase::{Evidence, Phase};
 use super::state::{ParticleFilter, Pending};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, PERIOD_S, RangeImage};
 use crate::localization::convergence::is_converged;
 use crate::localization::estimate::Estimate;
 use crate::localization::motion::{TurnDriveTurn, VelocityCommand};
-use crate::localization::observation::{above_road, agreement, ranges_along};
+use crate::localization::observation::{above_road, agreement, choose_beams, ranges_along};
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::spread;
 use crate::localization::resampling::systematic;
@@ -27,8 +27,10 @@ impl ParticleFilter {
         rng: &mut impl Rng,
     ) -> Result<Estimate, RenderError> {
         self.accumulate(odometry);
-        if !self.is_update_due(odometry) {
-            return self.coast(odometry, attitude);
+        if !self.is_update_due(odometry)
+            && let Some(coasted) = self.coast_unless_contradicted(odometry, scan, attitude, rng)?
+        {
+            return Ok(coasted);
         }
         self.propagate(odometry, rng);
         let update = match self.propose(scan, attitude, rng)? {
@@ -42,7 +44,7 @@ impl ParticleFilter {
         let evidence = self.evidence(&estimate, odometry);
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
-        estimate.state = self.phase.reported(evidence.is_precise);
+        estimate.state = self.phase.reported(evidence.is_sure);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
     }
@@ -78,6 +80,29 @@ impl ParticleFilter {
                 || pending.motion.rotation.angle().abs() > self.config.turn_thres_rad
         };
         odometry == Odometry::Unknown || self.pending.as_ref().is_none_or(moved_far)
+    }
+
+    /// The prediction of a frame in which the car hardly moved; `None` where its scan contradicts a pose that is tracked:
+    /// then it moved, whatever the odometry says.
+    fn coast_unless_contradicted(
+        &mut self,
+        odometry: Odometry,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Estimate>, RenderError> {
+        let mut coasted = self.coast(odometry, attitude)?;
+        let config = &self.config.proposal;
+        let beams = choose_beams(scan, config.weighed_beams, config.road_share, attitude, rng);
+        coasted.agreement = self.agreement_at(&coasted.map_from_lidar, &beams, attitude)?;
+        let agrees =
+            (coasted.agreement).map(|share| share >= self.config.tracking_loss.min_agreement);
+        if agrees == Some(false) && self.phase == Phase::Tracking {
+            return Ok(None);
+        }
+        let is_sure = self.is_precise(&coasted.covariance) && agrees == Some(true);
+        coasted.state = self.phase.reported(is_sure);
+        Ok(Some(coasted))
     }
 
     /// Moves the particles by noisy copies of the motion since the last update.
@@ -140,7 +165,7 @@ impl ParticleFilter {
             is_scattered: spread(&covariance).0 > config.max_spread_m,
             is_confirmed: self.agreement.confirm(is_converged, agreement, config),
             are_alike: agreement >= Some(config.min_agreement) && self.compares_places(),
-            is_precise: self.is_precise(&estimate.covariance),
+            is_sure: self.is_precise(&estimate.covariance) && agreement.is_some(),
             is_usual: self.agreement.is_usual(agreement, config),
         }
     }
