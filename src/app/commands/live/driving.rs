@@ -12,7 +12,7 @@ use super::super::localize::frame_tracker::FrameTracker;
 use super::super::localize::opened::Opened;
 use super::super::motion_source::{FrameMotion, MotionSource};
 use super::last_pose::LastPoseWriter;
-use super::robot::{ArrivedFrame, Robot};
+use super::robot::{ArrivedFrame, MeasuredPose, Robot};
 use crate::app::report::export::{LiveFrame, LiveLog, Sinks, live_log};
 use crate::app::report::results::{LatencySummary, LiveSummary};
 use crate::app::report::run_output;
@@ -26,6 +26,10 @@ use crate::localization::{LocalizerError, Start, TrackerError};
 
 /// Longest wait for a scan before the state is looked at.
 const WAIT: Duration = Duration::from_millis(50);
+
+/// Time between scans while it is not known, and the longest that is: a stall does not make the next one longer.
+const USUAL_PERIOD: Duration = Duration::from_millis(100);
+const LONGEST_PERIOD: Duration = Duration::from_secs(1);
 
 /// A drive whose scans arrive at their own pace.
 pub struct Drive<'a, 'b> {
@@ -108,8 +112,8 @@ struct Driver<'a, 'b> {
     last_pose: Option<LastPoseWriter>,
     log: Option<LiveLog>,
     robot: Robot<'a>,
-    /// Where the odometry has the sensor at the last scan that was localized, where it is measured.
-    odom_from_last: Option<Pose3>,
+    /// Time of the last scan that was localized [s], and the pose by the odometry, where it is measured.
+    measured_last: Option<(f64, MeasuredPose)>,
     summary: LiveSummary,
     /// Whether the map is prepared for the start.
     is_prepared: bool,
@@ -136,7 +140,7 @@ impl<'a, 'b> Driver<'a, 'b> {
             last_pose: LastPoseWriter::new(config),
             log,
             robot,
-            odom_from_last: None,
+            measured_last: None,
             summary: LiveSummary::default(),
             is_prepared,
             last_s: 0.0,
@@ -212,16 +216,17 @@ impl<'a, 'b> Driver<'a, 'b> {
             }
             Tick::Jumped => self.restart(stamp_s)?,
         }
-        let odom_from_lidar = (self.robot.odom_from_lidar)(frame.time_s);
-        let measured = self.moved_to(odom_from_lidar).map(FrameMotion::measured);
-        let tracked = match self.tracker.step(&frame, &scan, measured) {
+        let measured = (self.robot.measured)(frame.time_s);
+        let motion = self.moved_to(frame.time_s, measured.as_ref());
+        let motion = motion.map(FrameMotion::measured);
+        let tracked = match self.tracker.step(&frame, &scan, motion) {
             Err(error) if error.downcast_ref().is_some_and(is_about_scan) => {
                 self.reject(&error.to_string());
                 return Ok(());
             }
             tracked => tracked?,
         };
-        self.odom_from_last = odom_from_lidar;
+        self.measured_last = measured.map(|measured| (frame.time_s, measured));
         let before = self.monitor.reason();
         self.monitor
             .update(&tracked.estimate, &in_space(tracked.motion));
@@ -251,26 +256,28 @@ impl<'a, 'b> Driver<'a, 'b> {
         Ok(())
     }
 
-    /// The motion since the last scan that was localized, where both are measured.
-    fn moved_to(&self, odom_from_lidar: Option<Pose3>) -> Option<Pose3> {
-        Some(self.odom_from_last?.inverse() * odom_from_lidar?)
+    /// Motion from the last scan that was localized to a time [s], where both are measured and the odometry was not reset.
+    fn moved_to(&self, time_s: f64, measured: Option<&MeasuredPose>) -> Option<Pose3> {
+        let (last_s, last) = self.measured_last.as_ref()?;
+        measured?.since(last, time_s - last_s)
     }
 
     /// Looks at the state while no scan arrives.
     fn wait(&mut self) {
-        let (Some(last), Some(period)) = (self.last_arrival, self.period) else {
+        let Some(last) = self.last_arrival else {
             (self.robot.waiting)(now_s(), self.monitor.reason());
             return;
         };
+        let period = self.period.unwrap_or(USUAL_PERIOD).min(LONGEST_PERIOD);
         let (before, waited) = (self.monitor.reason(), last.elapsed());
         let now_s = self.last_s + self.drive.rate * waited.as_secs_f64();
-        let moved = self.moved_to((self.robot.odom_from_lidar)(now_s));
+        let moved = self.moved_to(now_s, (self.robot.measured)(now_s).as_ref());
         self.monitor.wait(waited, period, moved.as_ref());
         self.note_change(before, waited);
         (self.robot.waiting)(now_s, self.monitor.reason());
     }
 
-    /// Begins again at a start that was proposed, which the scans have to confirm.
+    /// Restarts at a proposed start, which the scans have to confirm.
     fn propose(&mut self, start: Start) -> Result<()> {
         let tiles = &self.drive.opened.map.tiles;
         if let Start::Pose { map_from_lidar, .. } = &start
@@ -278,14 +285,14 @@ impl<'a, 'b> Driver<'a, 'b> {
         {
             let t = map_from_lidar.translation;
             tracing::warn!(
-                "the pose that was proposed at x {:.1} m, y {:.1} m is outside the mapped area, and is left out",
+                "the pose that was proposed at x {:.1} m, y {:.1} m is outside the mapped area, and is left out; give one in the frame of the map",
                 t.x,
                 t.y
             );
             return Ok(());
         }
         self.tracker.restart(start)?;
-        (self.odom_from_last, self.is_prepared) = (None, true);
+        (self.measured_last, self.is_prepared) = (None, true);
         self.note(Reason::PoseProposed);
         Ok(())
     }
@@ -302,7 +309,7 @@ impl<'a, 'b> Driver<'a, 'b> {
             |last| Start::near(&last.map_from_lidar, opened.config.start.clone()),
         );
         self.tracker.restart(start)?;
-        self.odom_from_last = None;
+        self.measured_last = None;
         self.note(Reason::ClockJumped);
         Ok(())
     }

@@ -10,10 +10,31 @@ use crate::recording::Frame;
 /// A frame that arrived, and its scan.
 pub type ArrivedFrame = (Frame, Scan);
 
+/// A pose by the odometry of a robot.
+#[derive(Clone, Copy, Debug)]
+pub struct MeasuredPose {
+    /// Pose of the frame that the odometry measures: `p_odom = odom_from_child * p_child`.
+    pub odom_from_child: Pose3,
+    /// The lidar on it, as far as it is known by now.
+    pub child_from_lidar: Pose3,
+}
+
+impl MeasuredPose {
+    /// Motion of the lidar since an earlier pose, `previous_from_current`; `None` where it is faster than a car, because the
+    /// odometry was reset.
+    pub fn since(&self, earlier: &Self, duration_s: f64) -> Option<Pose3> {
+        /// Fastest motion [m/s].
+        const FASTEST: f64 = 100.0;
+        let moved = earlier.odom_from_child.inverse() * self.odom_from_child;
+        let is_possible = moved.translation.vector.norm() <= FASTEST * duration_s;
+        is_possible.then(|| self.child_from_lidar.inverse() * moved * self.child_from_lidar)
+    }
+}
+
 /// What a robot gives besides scans, and what it takes.
 pub struct Robot<'a> {
-    /// Where the odometry has the sensor at a time [s]; `None` where it is not measured.
-    pub odom_from_lidar: Box<dyn Fn(f64) -> Option<Pose3> + 'a>,
+    /// Pose by the odometry at a time [s]; `None` where it is not measured.
+    pub measured: Box<dyn Fn(f64) -> Option<MeasuredPose> + 'a>,
     /// A start that was proposed since the last call.
     pub proposed: Box<dyn Fn() -> Option<Start> + 'a>,
     /// Takes a frame that was localized.
@@ -23,13 +44,38 @@ pub struct Robot<'a> {
 }
 
 impl Default for Robot<'_> {
-    /// That of a recording: nothing but scans.
+    /// A recording: scans only.
     fn default() -> Self {
         Self {
-            odom_from_lidar: Box::new(|_| None),
+            measured: Box::new(|_| None),
             proposed: Box::new(|| None),
             localized: Box::new(|_| ()),
             waiting: Box::new(|_, _| ()),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+
+    use super::*;
+
+    #[test]
+    fn a_mounting_that_becomes_known_and_a_reset_of_the_odometry_are_no_motion() {
+        let step = Pose3::translation(0.5, 0.0, 0.0);
+        let pose = |odom_from_child: Pose3, child_from_lidar: Pose3| MeasuredPose {
+            odom_from_child,
+            child_from_lidar,
+        };
+        let first = pose(Pose3::translation(40.0, 7.0, 0.0), Pose3::identity());
+        let mounted = pose(
+            first.odom_from_child * step,
+            Pose3::translation(1.0, 0.0, 2.0),
+        );
+        let moved = mounted.since(&first, 0.1).unwrap();
+        assert_relative_eq!(moved, step, epsilon = 1e-12);
+        let reset = pose(step, mounted.child_from_lidar);
+        assert_eq!(reset.since(&mounted, 0.1), None);
     }
 }

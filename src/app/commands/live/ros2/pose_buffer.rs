@@ -19,8 +19,8 @@ const LONGEST_AHEAD_S: f64 = 0.1;
 pub struct PoseBuffer(VecDeque<(f64, Pose3)>);
 
 impl PoseBuffer {
-    /// Adds a pose at a time [s]. One that is not later than the last is left out; one much earlier begins anew, because the clock
-    /// was set.
+    /// Adds a pose at a time [s]. One that is not later than the last is left out; one more than half a second earlier restarts
+    /// the buffer, because the clock was set.
     pub fn push(&mut self, time_s: f64, parent_from_child: Pose3) {
         if let Some(&(last_s, _)) = self.0.back() {
             if time_s < last_s - LONGEST_GAP_S {
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_set_back_begins_anew_and_the_number_of_poses_is_limited() {
+    fn a_clock_that_is_set_back_restarts_the_buffer_and_the_number_of_poses_is_limited() {
         let mut buffer = buffer(&[10.0, 10.1, 10.05, 3.0, 3.1]);
         assert_eq!(buffer.0.len(), 2);
         for step in 0..2 * MOST_POSES {

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::pose_buffer::PoseBuffer;
+use crate::app::commands::live::robot::MeasuredPose;
 use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::localization::Start;
 use crate::localization::initialization::{StartDistribution, StartSpread};
@@ -106,9 +107,11 @@ impl Shared {
     pub fn transforms(&self, transforms: Vec<FramePose>) {
         let mut known = self.known();
         for it in transforms {
-            // Those of wheels and doors move, too.
-            let is_moving = it.child == self.base_frame || known.lidar_in(&it.child).is_some();
-            if !is_moving || it.parent == self.map_frame {
+            // Those of wheels and doors move, too, and a lidar may be on a mast.
+            let carries_lidar =
+                |frame: &str| *frame == self.base_frame || known.lidar_in(frame).is_some();
+            if !carries_lidar(&it.child) || carries_lidar(&it.parent) || it.parent == self.map_frame
+            {
                 continue;
             }
             let odom_frame = known.odom_frame.get_or_insert_with(|| {
@@ -137,8 +140,8 @@ impl Shared {
         }
     }
 
-    /// Where the topic of odometry has the lidar at a time [s].
-    pub fn odom_from_lidar(&self, time_s: f64) -> Option<Pose3> {
+    /// Pose by the topic of odometry at a time [s].
+    pub fn measured(&self, time_s: f64) -> Option<MeasuredPose> {
         let mut known = self.known();
         let odom_from_child = known.odometry.at(time_s)?;
         let child = known.odometry_child.clone();
@@ -147,17 +150,20 @@ impl Shared {
             known.has_warned_of_mounting = true;
             let lidar = known.lidar_frame.as_deref().unwrap_or_default();
             tracing::warn!(
-                "no static transform joins {child} to {lidar}: the odometry is taken as that of the lidar"
+                "no static transform joins {child} to {lidar}: the odometry is taken as that of the lidar; publish the mounting on /tf_static"
             );
         }
-        Some(odom_from_child * child_from_lidar.unwrap_or_default())
+        Some(MeasuredPose {
+            odom_from_child,
+            child_from_lidar: child_from_lidar.unwrap_or_default(),
+        })
     }
 
     /// Takes a pose in the map that was proposed, with standard deviations of position [m] and heading [rad].
     pub fn propose(&self, pose: FramePose, deviations: [f64; 2]) {
         if pose.parent != self.map_frame {
             tracing::warn!(
-                "a pose in {} was proposed, and is left out: it must be in {}",
+                "a pose in {} was proposed, and is left out: it must be in {}, the Fixed Frame of rviz",
                 pose.parent,
                 self.map_frame
             );
@@ -169,6 +175,8 @@ impl Shared {
     /// The start of the last pose that was proposed, once.
     pub fn proposed(&self) -> Option<Start> {
         let mut known = self.known();
+        // The mounting is known with the frame of the clouds.
+        known.lidar_frame.as_ref()?;
         let (map_from_base, deviations) = known.proposal.take()?;
         let base_from_lidar = known.lidar_in(&self.base_frame).unwrap_or_default();
         let limited = |k: usize| deviations[k].clamp(LEAST_DEVIATIONS[k], LARGEST_DEVIATIONS[k]);
@@ -309,14 +317,22 @@ mod tests {
     #[test]
     fn the_odometry_of_a_topic_is_that_of_the_lidar() {
         let shared = robot();
-        assert_eq!(shared.odom_from_lidar(5.0), None);
+        assert!(shared.measured(5.0).is_none());
         shared.odometry(vec![transform("odom", "base_link", 5.0, 2.0, 0.5)]);
-        let pose = shared.odom_from_lidar(5.0).unwrap();
-        assert_relative_eq!(pose.translation.x, 2.0 + 0.5_f64.cos(), epsilon = 1e-12);
+        let pose = shared.measured(5.0).unwrap();
+        let odom_from_lidar = pose.odom_from_child * pose.child_from_lidar;
+        let x = 2.0 + 0.5_f64.cos();
+        assert_relative_eq!(odom_from_lidar.translation.x, x, epsilon = 1e-12);
     }
 
     #[test]
     fn a_pose_is_proposed_once_for_the_lidar_and_only_in_the_map() {
+        // Before a cloud the lidar is not known: the proposal waits for it.
+        let early = Shared::new("map", "base_link");
+        early.propose(transform("map", "", 5.0, 7.0, 0.0), [0.5, 0.2]);
+        assert!(early.proposed().is_none());
+        early.cloud(0, "lidar", 5);
+        assert!(early.proposed().is_some());
         let shared = robot();
         shared.propose(transform("odom", "", 5.0, 7.0, 0.0), [0.5, 0.2]);
         assert!(shared.proposed().is_none());
