@@ -267,7 +267,7 @@ fn what_a_robot_cannot_have_is_an_error_before_any_work() {
     };
     live()
         .with("--odometry=wheels.txt")
-        .fails_with(&["odometry_file is wheels.txt", "such as /odom"]);
+        .fails_with(&["odometry_file is wheels.txt", "--odometry /odom"]);
     live()
         .with("--replay=velodyne")
         .rejects_usage_with(&["cannot be used with"]);

@@ -20,6 +20,10 @@ pub struct Ros2Args {
     #[arg(long, value_name = "IP")]
     pub interface: Option<IpAddr>,
 
+    /// Show the node in `ros2 node list` of Iron and later; nodes of Humble in the same domain misread this message, and may crash.
+    #[arg(long)]
+    pub node_info: bool,
+
     /// Frame of the map in ROS 2.
     #[arg(long, value_name = "FRAME", default_value = "map")]
     pub map_frame: String,
@@ -76,7 +80,7 @@ impl Ros2Args {
 }
 
 /// Parses the name of a topic.
-fn topic(text: &str) -> Result<String, &'static str> {
+pub(super) fn topic(text: &str) -> Result<String, &'static str> {
     let is_name = |part: &str| {
         let is_digit = part.starts_with(|c: char| c.is_ascii_digit());
         let is_part = |c: char| c.is_ascii_alphanumeric() || c == '_';

@@ -1,4 +1,4 @@
-//! A drive whose scans a robot sends.
+//! Localization of clouds from a topic of ROS 2.
 
 use std::cell::RefCell;
 use std::env;
@@ -8,7 +8,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Result, bail};
 
-use super::arguments::Ros2Args;
+use super::arguments::{Ros2Args, topic};
 use super::node::Node;
 use super::publisher::Publisher;
 use super::receiver::Receiver;
@@ -32,14 +32,25 @@ pub fn check(config: &LocalizationConfig) -> Result<()> {
             poses.display()
         );
     }
-    let odometry = config.motion.odometry_file.as_deref();
-    if let Some(file) = odometry.filter(|it| !it.starts_with("/")) {
+    if let Some(file) = &config.motion.odometry_file
+        && odometry_topic(config).is_none()
+    {
         bail!(
-            "odometry_file is {}, but that of a robot is a topic, such as /odom",
+            "odometry_file is {}, but the odometry of a robot is a topic; give one, such as --odometry /odom",
             file.display()
         );
     }
     Ok(())
+}
+
+/// The topic that is given as the file of odometry; `None` if it is no name of a topic.
+fn odometry_topic(config: &LocalizationConfig) -> Option<String> {
+    let file = config
+        .motion
+        .odometry_file
+        .as_deref()
+        .and_then(Path::to_str);
+    file.and_then(|it| topic(it).ok())
 }
 
 /// Localizes the clouds of a topic until it is requested to stop.
@@ -60,13 +71,10 @@ pub fn drive(
     );
     let networks = args.networks(range.as_deref(), is_local_only.as_deref())?;
     let odometry = match config.motion.odometry {
-        OdometrySource::Auto | OdometrySource::File => config
-            .motion
-            .odometry_file
-            .as_deref()
-            .and_then(Path::to_str),
+        OdometrySource::Auto | OdometrySource::File => odometry_topic(config),
         _ => None,
     };
+    let odometry = odometry.as_deref();
     let shared = Shared::new(&args.map_frame, &args.base_frame);
     let mut node = Node::open(NAME, domain, networks)?;
     let receiver = Receiver::new(
@@ -77,7 +85,9 @@ pub fn drive(
         config.recording.elevation_bias_deg,
     )?;
     let publisher = Publisher::new(&mut node, args, &shared)?;
-    node.announce()?;
+    if args.node_info {
+        node.announce()?;
+    }
     tracing::info!(
         "node /{NAME} of ROS 2 in domain {domain} localizes the clouds of {}",
         args.remapped(clouds)
@@ -89,7 +99,7 @@ pub fn drive(
 
     let publisher = RefCell::new(publisher);
     let robot = Robot {
-        odom_from_lidar: Box::new(|time_s| odometry.and_then(|_| shared.odom_from_lidar(time_s))),
+        measured: Box::new(|time_s| odometry.and_then(|_| shared.measured(time_s))),
         proposed: Box::new(|| shared.proposed()),
         localized: Box::new(|frame| publisher.borrow_mut().localized(frame)),
         waiting: Box::new(|time_s, reason| publisher.borrow_mut().waiting(time_s, reason)),
@@ -99,7 +109,10 @@ pub fn drive(
         receiver.run(&node, &shared, inbox, unreadable, interrupt);
     })?;
     if (drive.recorded)().results.is_empty() {
-        bail!("no scan of {} was localized", args.remapped(clouds));
+        bail!(
+            "no scan of {} was localized; check the name of the topic, --domain and --interface",
+            args.remapped(clouds)
+        );
     }
     interrupt.accept();
     Ok(())

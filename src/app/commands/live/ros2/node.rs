@@ -57,7 +57,7 @@ pub struct Node {
     subscriber: Subscriber,
     readers: Vec<GUID>,
     writers: Vec<GUID>,
-    /// Says which node the readers and writers belong to.
+    /// Announces the node of the readers and writers.
     announcement: Option<Writer>,
 }
 
@@ -117,7 +117,7 @@ impl Node {
         Ok(writer)
     }
 
-    /// Tells other nodes the name of this one and what belongs to it, after all readers and writers were made.
+    /// Announces the name of the node, its readers and writers, in the format of Iron and later; call it after they were made.
     pub fn announce(&mut self) -> Result<()> {
         const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
         let writer = self.raw_writer("ros_discovery_info", TYPE, Quality::Latched, 1)?;

@@ -88,7 +88,7 @@ impl<'a> Publisher<'a> {
             return;
         };
         if frame.reason.state().is_believed() {
-            self.believed(&frame.estimate, &place);
+            self.publish_pose(&frame.estimate, &place);
         }
         let deviations = Axes::new(&frame.estimate.covariance, &frame.estimate.pose);
         let [_, _, heading_rad] = frame.estimate.standard_deviations();
@@ -122,11 +122,12 @@ impl<'a> Publisher<'a> {
         self.diagnose(reason, (1e9 * time_s.max(0.0)) as u64, &[]);
     }
 
-    fn believed(&self, estimate: &Estimate, place: &Place) {
+    fn publish_pose(&self, estimate: &Estimate, place: &Place) {
         let (map, stamp_ns) = (self.shared.map_frame.as_str(), place.moment_ns);
         let lidar_from_child = place.child_from_lidar.inverse();
         let map_from_child = estimate.map_from_lidar * lidar_from_child;
-        let covariance = covariance_of_child(estimate, &map_from_child);
+        let lever = map_from_child.translation.vector - estimate.map_from_lidar.translation.vector;
+        let covariance = covariance_of_child(&estimate.covariance, &lever);
         let pose = Cdr::with_header(stamp_ns, map).pose(&map_from_child);
         self.pose.send(pose.covariance(&covariance));
         let [linear, angular] = velocity(estimate.motion.as_ref(), &lidar_from_child);
@@ -139,6 +140,8 @@ impl<'a> Publisher<'a> {
         let (child, transform) = match &place.odom_from_child {
             Some((odom, Some(pose))) => (odom, map_from_child * pose.inverse()),
             Some((_, None)) => return,
+            // A driver may name no frame.
+            None if place.child.is_empty() => return,
             None => (&place.child, map_from_child),
         };
         let message = Cdr::default().u32(1).header(stamp_ns, map).text(child);
@@ -187,12 +190,11 @@ fn level(state: LiveState) -> u8 {
 
 /// The covariance of the child frame, x, y, z, roll, pitch, yaw: that of the lidar, whose heading moves a frame that is
 /// d = (dx, dy) away by (−dy, dx) per radian. Zero where nothing is estimated.
-fn covariance_of_child(estimate: &Estimate, map_from_child: &Pose3) -> Matrix6<f64> {
+fn covariance_of_child(of_lidar: &Matrix3<f64>, d: &Vector3<f64>) -> Matrix6<f64> {
     /// Rows of x, y and heading.
     const ROWS: [usize; 3] = [0, 1, 5];
-    let d = map_from_child.translation.vector - estimate.map_from_lidar.translation.vector;
     let lever = Matrix3::new(1.0, 0.0, -d.y, 0.0, 1.0, d.x, 0.0, 0.0, 1.0);
-    let planar = lever * estimate.covariance * lever.transpose();
+    let planar = lever * of_lidar * lever.transpose();
     let mut covariance = Matrix6::zeros();
     for (i, row) in ROWS.into_iter().enumerate() {
         for (j, column) in ROWS.into_iter().enumerate() {
@@ -287,6 +289,17 @@ mod tests {
     fn a_cloud_without_a_stamp_has_that_of_its_arrival() {
         let sent = received(cloud(&[Vec3::ONE], 0, "lidar"));
         assert_eq!(ReceivedCloud::read(&sent, 17).unwrap().moment_ns, 17);
+    }
+
+    #[test]
+    fn the_heading_of_the_lidar_makes_a_frame_behind_it_uncertain_across() {
+        // The frame is 2 m behind along x: y moves by -2 m per radian.
+        let of_lidar = Matrix3::from_diagonal(&Vector3::new(0.0, 0.0, 0.01));
+        let covariance = covariance_of_child(&of_lidar, &Vector3::new(-2.0, 0.0, 0.0));
+        assert_relative_eq!(covariance[(1, 1)], 0.04, epsilon = 1e-12);
+        assert_relative_eq!(covariance[(1, 5)], -0.02, epsilon = 1e-12);
+        assert_relative_eq!(covariance[(5, 5)], 0.01, epsilon = 1e-12);
+        assert_eq!((covariance[(0, 0)], covariance[(2, 2)]), (0.0, 0.0));
     }
 
     #[test]

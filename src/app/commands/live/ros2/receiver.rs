@@ -1,5 +1,6 @@
 //! The thread that receives: clouds into the inbox, all else to where it is known.
 
+use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
@@ -20,8 +21,11 @@ use crate::recording::{Frame, ScanSource};
 /// Longest time between two looks at the topics and at whether it is requested to stop.
 const POLL: Duration = Duration::from_millis(20);
 
-/// Time without a cloud after which it is said which topics there are.
+/// Time without a cloud after which the existing topics are reported.
 const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Number of messages of a topic that are read in a row.
+const MOST_AT_ONCE: usize = 1000;
 
 /// Type of clouds.
 const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
@@ -39,10 +43,11 @@ pub struct Receiver {
     warned: Warned,
 }
 
-/// What was said once.
+/// Warnings that were printed.
 #[derive(Default)]
 struct Warned {
-    of_message: bool,
+    /// Topics with damaged messages.
+    of_messages: BTreeSet<String>,
     of_times: bool,
     of_silence: bool,
 }
@@ -104,7 +109,13 @@ impl Receiver {
             }
             self.receive_all_but_clouds(shared);
             let mut has_received = false;
-            while let Some(message) = self.clouds.take() {
+            for _ in 0..MOST_AT_ONCE {
+                if interrupt.requested() || inbox.is_closed() {
+                    break;
+                }
+                let Some(message) = self.clouds.take() else {
+                    break;
+                };
                 has_received = true;
                 // What was sent before the cloud is known before it is localized.
                 self.receive_all_but_clouds(shared);
@@ -123,8 +134,9 @@ impl Receiver {
             }
             if has_received {
                 last_cloud = Instant::now();
+                self.warned.of_silence = false;
             } else {
-                self.warn_of_silence(node, number == 0 && last_cloud.elapsed() > PATIENCE);
+                self.warn_of_silence(node, last_cloud.elapsed() > PATIENCE);
                 thread::park_timeout(POLL);
             }
         }
@@ -132,14 +144,23 @@ impl Receiver {
     }
 
     fn receive_all_but_clouds(&mut self, shared: &Shared) {
-        while let Some(message) = self.static_transforms.take() {
+        for _ in 0..MOST_AT_ONCE {
+            let Some(message) = self.static_transforms.take() else {
+                break;
+            };
             let take = |it| shared.static_transforms(it);
             self.read("/tf_static", message, read_transforms, take);
         }
-        while let Some(message) = self.transforms.take() {
+        for _ in 0..MOST_AT_ONCE {
+            let Some(message) = self.transforms.take() else {
+                break;
+            };
             self.read("/tf", message, read_transforms, |it| shared.transforms(it));
         }
-        while let Some(message) = self.odometry.as_ref().and_then(Reader::take) {
+        for _ in 0..MOST_AT_ONCE {
+            let Some(message) = self.odometry.as_ref().and_then(Reader::take) else {
+                break;
+            };
             self.read("the odometry", message, read_odometry, |it| {
                 shared.odometry(it);
             });
@@ -167,7 +188,7 @@ impl Receiver {
     fn arrived(&mut self, number: usize, cloud: ReceivedCloud) -> ArrivedFrame {
         if cloud.has_unknown_times && !std::mem::replace(&mut self.warned.of_times, true) {
             tracing::warn!(
-                "the times of the points of {} are ignored: in no unit do they last 10 ms to 1 s and agree with the stamp",
+                "the times of the points of {} are ignored: in no unit do they last 10 ms to 1 s and agree with the stamp; correct the driver, or set motion_compensation",
                 self.topic
             );
         }
@@ -180,12 +201,14 @@ impl Receiver {
     }
 
     fn warn_of_message(&mut self, topic: &str, problem: &str) {
-        if !std::mem::replace(&mut self.warned.of_message, true) {
-            tracing::warn!("a message of {topic} is left out: it {problem}");
+        if self.warned.of_messages.insert(topic.to_owned()) {
+            tracing::warn!(
+                "a message of {topic} is left out: it {problem}; check that its publisher has the same version of the type (later ones are not reported)"
+            );
         }
     }
 
-    /// Says what there is instead of the topic of the clouds.
+    /// Warns, once per silence, with the topics that have clouds.
     fn warn_of_silence(&mut self, node: &Node, is_silent: bool) {
         if !is_silent || std::mem::replace(&mut self.warned.of_silence, true) {
             return;
@@ -197,7 +220,11 @@ impl Receiver {
         } else {
             format!("topics with clouds are {}", others.join(", "))
         };
-        tracing::warn!("no cloud has arrived on {}; {found}", self.topic);
+        tracing::warn!(
+            "no cloud has arrived on {} for {} s; {found}",
+            self.topic,
+            PATIENCE.as_secs()
+        );
     }
 }
 
