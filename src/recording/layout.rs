@@ -87,9 +87,11 @@ impl RecordingFiles {
         let poses = || existing(base, &["poses.txt", "poses_tum.txt", "poses.tum"]);
         let calibration = existing(base, &["calib.txt"]);
         let times = existing(base, &["times.txt"]);
-        // The name of a folder is enough for the one above it; of `.` and `..` it is not.
-        let above =
-            (base.file_name().and(base.parent())).map_or_else(|| base.join(".."), Path::to_owned);
+        // Above a link is the folder of its target; the name of any other folder is enough.
+        let named = base.file_name().filter(|_| !base.is_symlink());
+        let above = named
+            .and(base.parent())
+            .map_or_else(|| base.join(".."), Path::to_owned);
         let times_above = existing(&above, &["times.txt"]);
         if base.join("velodyne_points/data").is_dir() {
             return Self {
