@@ -36,12 +36,7 @@ const WRONG_M: f64 = 0.5;
 const MEMORY_KIB: usize = 3 << 20;
 
 /// Variants of which frames may still be wrong and called tracking.
-const KNOWN: [&str; 4] = [
-    "every scan twice",
-    "ranges times 0.9",
-    "28 degrees of view",
-    "every other scan empty",
-];
+const KNOWN: [&str; 2] = ["every scan twice", "ranges times 0.9"];
 
 type Scan = Vec<[f32; 4]>;
 
