@@ -97,8 +97,7 @@ fn empty_scans_stop_no_command() {
     recording.write_scan(0, &[]);
     recording.write_scan(3, &[]);
     recording.fpmcl("build-map").succeeds();
-    // An empty scan confirms no pose, and in so coarse a map the next one hardly does.
-    recording.fpmcl("localize").exits_with(3);
+    recording.fpmcl("localize").succeeds();
     recording.fpmcl("refine").succeeds();
 }
 

@@ -3,25 +3,24 @@
 //! ```text
 //! from       condition                                       to         reason
 //! Searching  agreement too low                               Lost       none of the particles is right
-//! Searching  confirmed and sure                              Tracking   the pose is found
+//! Searching  confirmed and precise                           Tracking   the pose is found
 //! Searching  confirmed                                       Uncertain  the place is found, as in a tunnel
 //! Searching  no decision within `patience` updates           Lost       no pose is found
 //! Tracking   agreement too low, or particles scattered       Lost       the scan does not fit, or nothing holds the pose
-//! Tracking   not sure                                        Uncertain  the pose is followed by the odometry
+//! Tracking   not precise                                     Uncertain  the pose is followed by the odometry
 //! Uncertain  agreement too low, or particles scattered       Lost       as while tracking
-//! Uncertain  sure, and the agreement as usual                Tracking   the pose is confirmed again
-//! Lost       confirmed and sure, agreement high enough       Tracking   the alarm was false
+//! Uncertain  precise, and the agreement as usual             Tracking   the pose is confirmed again
+//! Lost       confirmed and precise, agreement high enough    Tracking   the alarm was false
 //! Lost       confirmed, agreement high enough                Uncertain  the alarm was false
 //! Lost       panoramas resemble the scan                     Searching  restart, within the same frame
 //! ```
 //!
 //! Thresholds: [`tracking_loss`](crate::localization::tracking_loss), [`convergence`](crate::localization::convergence),
 //! and for what is searched [`places`](crate::localization::places).
-//! Sure: the position is precise, and the scan was compared with the map.
 //! Without panoramas the filter stays `Lost` until a pose is confirmed. What is reported, see [`Phase::reported`]:
 //!
 //! ```text
-//! Searching  searching          Tracking  tracking; searching while the pose is not sure
+//! Searching  searching          Tracking  tracking; searching while the position is not precise, or nothing is compared
 //! Uncertain  searching          Lost      lost
 //! ```
 
@@ -40,7 +39,7 @@ pub(super) enum Phase {
     },
     /// The pose is followed.
     Tracking,
-    /// The pose is followed, and was not confirmed since it was last not sure.
+    /// The pose is followed, and was not confirmed since the position was last imprecise.
     Uncertain,
     /// The pose is wrong.
     Lost { search: Search },
@@ -71,8 +70,8 @@ pub(super) struct Evidence {
     pub is_confirmed: bool,
     /// Several places agree with the scan: driving decides.
     pub are_alike: bool,
-    /// The standard deviation of the position is at most `sure_spread_m`, and the scan was compared with the map.
-    pub is_sure: bool,
+    /// The standard deviation of the position is at most `sure_spread_m`.
+    pub is_precise: bool,
     /// The agreement is as large as usual here.
     pub is_usual: bool,
 }
@@ -99,7 +98,7 @@ impl Phase {
 
     /// The phase after an update: the table in the head of this module.
     pub fn after(self, update: &Evidence, patience: usize) -> Self {
-        let tracked = if update.is_sure {
+        let tracked = if update.is_precise {
             Self::Tracking
         } else {
             Self::Uncertain
@@ -125,7 +124,8 @@ impl Phase {
         }
     }
 
-    /// The state of a frame; `is_sure` is of its own pose, which the odometry makes uncertain between updates.
+    /// The state of a frame; `is_sure`: its position is precise, which the odometry changes between updates, and its scan was
+    /// compared with the map.
     pub fn reported(self, is_sure: bool) -> State {
         match self {
             Self::Tracking if is_sure => State::Tracking,
@@ -186,7 +186,7 @@ mod tests {
                 is_scattered: bit(1),
                 is_confirmed: bit(2),
                 are_alike: bit(3),
-                is_sure: bit(4),
+                is_precise: bit(4),
                 is_usual: bit(5),
             }
         })
@@ -301,21 +301,21 @@ mod tests {
     }
 
     #[test]
-    fn an_uncertain_pose_is_tracked_again_only_if_it_is_sure_and_as_many_beams_agree_as_usual() {
+    fn an_uncertain_pose_is_tracked_again_only_if_it_is_precise_and_as_many_beams_agree_as_usual() {
         for update in evidence() {
             let after = Phase::Uncertain.after(&update, PATIENCE);
             let is_lost = update.disagrees || update.is_scattered;
-            let is_tracked = !is_lost && update.is_sure && update.is_usual;
+            let is_tracked = !is_lost && update.is_precise && update.is_usual;
             assert_eq!(after == Phase::Tracking, is_tracked);
         }
     }
 
     #[test]
-    fn only_a_pose_that_is_tracked_and_sure_is_reported_as_tracking() {
+    fn only_a_pose_that_is_tracked_and_precise_is_reported_as_tracking() {
         for phase in phases() {
-            for is_sure in [false, true] {
-                let is_tracked = phase == Phase::Tracking && is_sure;
-                let state = phase.reported(is_sure);
+            for is_precise in [false, true] {
+                let is_tracked = phase == Phase::Tracking && is_precise;
+                let state = phase.reported(is_precise);
                 assert_eq!(state == State::Tracking, is_tracked);
                 assert_eq!(state == State::Lost, name(phase) == "Lost");
             }

@@ -44,7 +44,8 @@ impl ParticleFilter {
         let evidence = self.evidence(&estimate, odometry);
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
-        estimate.state = self.phase.reported(evidence.is_sure);
+        let is_sure = evidence.is_precise && estimate.agreement.is_some();
+        estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
     }
@@ -165,7 +166,7 @@ impl ParticleFilter {
             is_scattered: spread(&covariance).0 > config.max_spread_m,
             is_confirmed: self.agreement.confirm(is_converged, agreement, config),
             are_alike: agreement >= Some(config.min_agreement) && self.compares_places(),
-            is_sure: self.is_precise(&estimate.covariance) && agreement.is_some(),
+            is_precise: self.is_precise(&estimate.covariance),
             is_usual: self.agreement.is_usual(agreement, config),
         }
     }
