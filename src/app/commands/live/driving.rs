@@ -73,7 +73,7 @@ impl Drive<'_, '_> {
                 scope.spawn(move || writer.run(&mesh, first_s));
                 log
             });
-            let mut driver = Driver::new(self, tracker, is_prepared, (log, robot));
+            let mut driver = Driver::new(self, tracker, is_prepared, log, robot);
             let outcome = driver.follow(&inbox);
             // Nobody takes what the other thread would still send.
             inbox.close();
@@ -96,10 +96,15 @@ impl Drive<'_, '_> {
     }
 }
 
+/// Now, in nanoseconds since 1970.
+pub fn now_ns() -> u64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    since.map_or(0, |it| it.as_nanos() as u64)
+}
+
 /// Now, in seconds since 1970.
 fn now_s() -> f64 {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    since.map_or(0.0, |it| it.as_secs_f64())
+    1e-9 * now_ns() as f64
 }
 
 /// The thread that computes.
@@ -128,7 +133,8 @@ impl<'a, 'b> Driver<'a, 'b> {
         drive: &'a Drive<'a, 'b>,
         tracker: FrameTracker<'a>,
         is_prepared: bool,
-        (log, robot): (Option<LiveLog>, Robot<'a>),
+        log: Option<LiveLog>,
+        robot: Robot<'a>,
     ) -> Self {
         let config = &drive.opened.config;
         Self {

@@ -4,7 +4,6 @@ use std::cell::RefCell;
 use std::env;
 use std::iter;
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Result, bail};
 
@@ -13,7 +12,7 @@ use super::node::Node;
 use super::publisher::Publisher;
 use super::receiver::Receiver;
 use super::shared::Shared;
-use crate::app::commands::live::driving::Drive;
+use crate::app::commands::live::driving::{Drive, now_ns};
 use crate::app::commands::live::robot::Robot;
 use crate::app::commands::motion_source::MotionSource;
 use crate::app::report::export::Sinks;
@@ -93,8 +92,7 @@ pub fn drive(
         args.remapped(clouds)
     );
     let mesh = run_output::map_around(&drive.opened.map, iter::empty())?;
-    let now = SystemTime::now().duration_since(UNIX_EPOCH);
-    publisher.map(&mesh.vertices, now.map_or(0, |it| it.as_nanos() as u64));
+    publisher.map(&mesh.vertices, now_ns());
     drop(mesh);
 
     let publisher = RefCell::new(publisher);

@@ -111,17 +111,15 @@ impl Node {
         quality: Quality,
         depth: i32,
     ) -> Result<Writer> {
-        let writer =
-            self.raw_writer(&wire_topic(topic), &wire_type(message_type), quality, depth)?;
-        self.writers.push(writer.0.guid());
-        Ok(writer)
+        let policies = quality.policies(depth);
+        self.raw_writer(&wire_topic(topic), &wire_type(message_type), policies)
     }
 
     /// Announces the name of the node, its readers and writers, in the format of Iron and later; call it after they were made.
     pub fn announce(&mut self) -> Result<()> {
         const TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
-        let writer = self.raw_writer("ros_discovery_info", TYPE, Quality::Latched, 1)?;
-        self.writers.push(writer.0.guid());
+        let policies = Quality::Latched.policies(1);
+        let writer = self.raw_writer("ros_discovery_info", TYPE, policies)?;
         let mut info = Cdr::default().array(&self.participant.guid().to_bytes());
         // One node, in the topmost namespace.
         info = info.u32(1).text("/").text(self.name);
@@ -149,19 +147,18 @@ impl Node {
         names
     }
 
+    /// Offers a topic by its name and type on the wire.
     fn raw_writer(
-        &self,
+        &mut self,
         topic: &str,
         message_type: &str,
-        quality: Quality,
-        depth: i32,
+        policies: QosPolicies,
     ) -> Result<Writer> {
-        let policies = quality.policies(depth);
         let topic = self.topic(topic, message_type, &policies)?;
-        let writer = self
-            .publisher
-            .create_datawriter_no_key(&topic, Some(policies))?;
-        Ok(Writer(writer))
+        let publisher = &self.publisher;
+        let writer = Writer(publisher.create_datawriter_no_key(&topic, Some(policies))?);
+        self.writers.push(writer.0.guid());
+        Ok(writer)
     }
 
     fn topic(&self, name: &str, message_type: &str, policies: &QosPolicies) -> Result<Topic> {

@@ -1,7 +1,7 @@
-//! What the node says: pose, odometry, transform, diagnostics, and the map once.
+//! Messages that the node publishes: pose, odometry, transform, diagnostics, and the map once.
 //!
 //! The transform is that of REP-105 (Meeussen, *Coordinate Frames for Mobile Platforms*, 2010): from the map to the frame of the
-//! odometry where somebody publishes the robot in it, else to the robot; never both, and only while the pose is believed.
+//! odometry where somebody publishes the robot in it, else to the robot; never both, and only while tracking or coasting.
 
 use std::time::{Duration, Instant};
 

@@ -1,15 +1,17 @@
 //! The thread that receives: clouds into the inbox, all else to where it is known.
 
 use std::collections::BTreeSet;
+use std::iter;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
 use super::arguments::Ros2Args;
 use super::node::{Node, Quality, Reader, waker};
 use super::shared::Shared;
+use crate::app::commands::live::driving::now_ns;
 use crate::app::commands::live::robot::ArrivedFrame;
 use crate::app::run::Interrupt;
 use crate::live::Inbox;
@@ -50,6 +52,33 @@ struct Warned {
     of_messages: BTreeSet<String>,
     of_times: bool,
     of_silence: bool,
+}
+
+impl Warned {
+    /// Reads the messages of a topic and has them taken; those that are damaged are left out.
+    fn receive<T>(
+        &mut self,
+        topic: &str,
+        reader: &Reader,
+        read: impl Fn(&[u8]) -> Result<T, String>,
+        take: impl Fn(T),
+    ) {
+        for message in iter::from_fn(|| reader.take()).take(MOST_AT_ONCE) {
+            match message.and_then(|message| read(&message)) {
+                Ok(read) => take(read),
+                Err(problem) => self.warn_of_message(topic, &problem),
+            }
+        }
+    }
+
+    /// Warns of the first damaged message of a topic.
+    fn warn_of_message(&mut self, topic: &str, problem: &str) {
+        if self.of_messages.insert(topic.to_owned()) {
+            tracing::warn!(
+                "a message of {topic} is left out: it {problem}; check that its publisher has the same version of the type (later ones are not reported)"
+            );
+        }
+    }
 }
 
 impl Receiver {
@@ -127,7 +156,7 @@ impl Receiver {
                     }
                     Err(problem) => {
                         unreadable.fetch_add(1, Ordering::Relaxed);
-                        self.warn_of_message(&self.topic.clone(), &problem);
+                        self.warned.warn_of_message(&self.topic, &problem);
                     }
                 }
                 number += 1;
@@ -144,45 +173,30 @@ impl Receiver {
     }
 
     fn receive_all_but_clouds(&mut self, shared: &Shared) {
-        for _ in 0..MOST_AT_ONCE {
-            let Some(message) = self.static_transforms.take() else {
-                break;
-            };
-            let take = |it| shared.static_transforms(it);
-            self.read("/tf_static", message, read_transforms, take);
-        }
-        for _ in 0..MOST_AT_ONCE {
-            let Some(message) = self.transforms.take() else {
-                break;
-            };
-            self.read("/tf", message, read_transforms, |it| shared.transforms(it));
-        }
-        for _ in 0..MOST_AT_ONCE {
-            let Some(message) = self.odometry.as_ref().and_then(Reader::take) else {
-                break;
-            };
-            self.read("the odometry", message, read_odometry, |it| {
+        let warned = &mut self.warned;
+        warned.receive(
+            "/tf_static",
+            &self.static_transforms,
+            read_transforms,
+            |it| {
+                shared.static_transforms(it);
+            },
+        );
+        warned.receive("/tf", &self.transforms, read_transforms, |it| {
+            shared.transforms(it);
+        });
+        if let Some(odometry) = &self.odometry {
+            warned.receive("the odometry", odometry, read_odometry, |it| {
                 shared.odometry(it);
             });
         }
-        while let Some(message) = self.proposals.take() {
-            let take = |(pose, deviations)| shared.propose(pose, deviations);
-            self.read("/initialpose", message, read_pose_with_deviations, take);
-        }
-    }
-
-    /// Reads a message and has it taken; warns of the first that is damaged.
-    fn read<T>(
-        &mut self,
-        topic: &str,
-        message: Result<Vec<u8>, String>,
-        read: impl FnOnce(&[u8]) -> Result<T, String>,
-        take: impl FnOnce(T),
-    ) {
-        match message.and_then(|message| read(&message)) {
-            Ok(read) => take(read),
-            Err(problem) => self.warn_of_message(topic, &problem),
-        }
+        let propose = |(pose, deviations)| shared.propose(pose, deviations);
+        warned.receive(
+            "/initialpose",
+            &self.proposals,
+            read_pose_with_deviations,
+            propose,
+        );
     }
 
     fn arrived(&mut self, number: usize, cloud: ReceivedCloud) -> ArrivedFrame {
@@ -198,14 +212,6 @@ impl Receiver {
         // A scan of a robot is not kept.
         let source = ScanSource::Memory(Default::default());
         (Frame::new(number, source, time_s), scan)
-    }
-
-    fn warn_of_message(&mut self, topic: &str, problem: &str) {
-        if self.warned.of_messages.insert(topic.to_owned()) {
-            tracing::warn!(
-                "a message of {topic} is left out: it {problem}; check that its publisher has the same version of the type (later ones are not reported)"
-            );
-        }
     }
 
     /// Warns, once per silence, with the topics that have clouds.
@@ -226,10 +232,4 @@ impl Receiver {
             PATIENCE.as_secs()
         );
     }
-}
-
-/// Now, in nanoseconds since 1970.
-fn now_ns() -> u64 {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    since.map_or(0, |it| it.as_nanos() as u64)
 }
