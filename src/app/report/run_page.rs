@@ -42,7 +42,7 @@ pub const PICTURES: [(&str, &str, &str); 7] = [
     (
         "States",
         "states.png",
-        "Standard deviation that the filter states, and share of the beams above the road that end on a surface of the map",
+        "Standard deviation of the position that the filter reports, and share of the beams above the road that end on a surface of the map",
     ),
     (
         "Drift",

@@ -243,10 +243,7 @@ impl<'a> Drawing<'a> {
             series.filter(|it| !it.points.is_empty()).collect()
         };
         let panels = [
-            Panel::new(
-                "standard deviation of the position, MCL [cm]",
-                by_state(&sigmas_cm),
-            ),
+            Panel::new("standard deviation [cm]", by_state(&sigmas_cm)),
             Panel::new("beams on the map [%]", by_state(&percent)),
         ];
         self.save(
