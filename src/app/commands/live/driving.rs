@@ -209,7 +209,9 @@ impl<'a, 'b> Driver<'a, 'b> {
             scan: (frame, scan),
             arrived,
         } = arrival;
-        self.period = self.last_arrival.map(|last| arrived.duration_since(last));
+        self.period = self
+            .last_arrival
+            .map(|last| self.recorded_time(arrived.duration_since(last)));
         (self.last_arrival, self.last_s) = (Some(arrived), frame.time_s);
         let stamp_s = scan.time_s.unwrap_or(frame.time_s);
         match self.clock.tick(stamp_s, arrived) {
@@ -268,6 +270,12 @@ impl<'a, 'b> Driver<'a, 'b> {
         measured?.since(last, time_s - last_s)
     }
 
+    /// A time between arrivals as it was when it was recorded, so that a slow replay is no stalled sensor. Of a fast one it is
+    /// the time that passes: the files may be what is slow.
+    fn recorded_time(&self, passed: Duration) -> Duration {
+        passed.mul_f64(self.drive.rate.min(1.0))
+    }
+
     /// Looks at the state while no scan arrives.
     fn wait(&mut self) {
         let Some(last) = self.last_arrival else {
@@ -278,7 +286,8 @@ impl<'a, 'b> Driver<'a, 'b> {
         let (before, waited) = (self.monitor.reason(), last.elapsed());
         let now_s = self.last_s + self.drive.rate * waited.as_secs_f64();
         let moved = self.moved_to(now_s, (self.robot.measured)(now_s).as_ref());
-        self.monitor.wait(waited, period, moved.as_ref());
+        self.monitor
+            .wait(self.recorded_time(waited), period, moved.as_ref());
         self.note_change(before, waited);
         (self.robot.waiting)(now_s, self.monitor.reason());
     }
