@@ -67,7 +67,7 @@ fn main() {
 fn depth_8(bencher: divan::Bencher<'_, '_>, count: usize) {
     let cloud = noisy_street(count);
     let config = PoissonConfig {
-        depth: 8,
+        depth: Some(8),
         ..PoissonConfig::default()
     };
     bencher.bench_local(|| reconstruct(&cloud, &config, MemoryBudget::default()).unwrap());
@@ -76,8 +76,12 @@ fn depth_8(bencher: divan::Bencher<'_, '_>, count: usize) {
 #[divan::bench(args = SIZES, sample_count = 3, sample_size = 1)]
 fn depth_9(bencher: divan::Bencher<'_, '_>, count: usize) {
     let cloud = noisy_street(count);
+    let config = PoissonConfig {
+        depth: Some(9),
+        ..PoissonConfig::default()
+    };
     bencher.bench_local(|| {
-        reconstruct(&cloud, &PoissonConfig::default(), MemoryBudget::default()).unwrap()
+        reconstruct(&cloud, &config, MemoryBudget::default()).unwrap()
     });
 }
 
@@ -181,7 +185,7 @@ fn noisy_street(count: usize) -> PointCloud {
 fn run_once(count: usize, depth: u32) {
     let cloud = noisy_street(count);
     let config: PoissonConfig = PoissonConfig {
-        depth,
+        depth: Some(depth),
         iterations: parse_env("ITERATIONS", PoissonConfig::default().iterations),
         point_weight: parse_env("POINT_WEIGHT", PoissonConfig::default().point_weight),
         samples_per_node: parse_env(

@@ -42,8 +42,8 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
     let scans: [Scan; 2] = [whole, thinned];
     let mut config = MapConfig::default();
     config.local_map.ground_threshold = ground_threshold;
-    config.local_map.poisson.depth = 6;
-    (config.local_map.crop_x_m, config.local_map.crop_y_m) = (10.0, 10.0);
+    config.local_map.poisson.depth = Some(6);
+    (config.local_map.crop_x_m, config.local_map.crop_y_m) = (Some(10.0), Some(10.0));
     config.local_map.visibility.enabled = false;
     let sensor = Sensor {
         range_image: LidarModel::default(),

@@ -23,10 +23,10 @@ mod stencil;
 mod weights;
 
 pub use error::MeshingError;
-pub use poisson::{PoissonConfig, Reconstruction, reconstruct};
+pub use poisson::{PoissonConfig, Reconstruction, reconstruct, reconstruct_resolved};
 
 pub(crate) use manifold::split_fans;
-pub(crate) use simplify::simplify_ground;
+pub(crate) use simplify::simplify;
 pub(crate) use trimming::{trim_by_density, trim_by_distance};
 
 #[cfg(test)]

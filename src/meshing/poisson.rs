@@ -12,6 +12,7 @@
 
 use std::ops::RangeInclusive;
 
+use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -38,9 +39,11 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PoissonConfig {
-    /// Depth of the finest cells, the number of bisections of the cube, 3 to 12.
-    #[default(9)]
-    pub depth: u32,
+    /// Edge of the finest cells where `depth` is not given, 0.01 to 1.5 [m].
+    #[default(0.1)]
+    pub cell_m: f32,
+    /// Depth of the finest cells, the number of bisections of the cube, 3 to 12; null: as many as lead to `cell_m`.
+    pub depth: Option<u32>,
     /// Edge of the cube over the longest edge of the points' bounding box, 1.05 to 10 (unitless).
     #[default(1.1)]
     pub scale: f32,
@@ -62,7 +65,12 @@ impl PoissonConfig {
 
 impl Validate for PoissonConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        in_range("depth", self.depth, Self::DEPTHS)?;
+        in_range("cell_m", self.cell_m, 0.01..=MAX_CELL_M)?;
+        in_range(
+            "depth",
+            self.depth.unwrap_or(*Self::DEPTHS.end()),
+            Self::DEPTHS,
+        )?;
         in_range("scale", self.scale, 1.05..=10.0)?;
         not_negative("point_weight", self.point_weight)?;
         positive("samples_per_node", self.samples_per_node)?;
@@ -102,25 +110,45 @@ pub fn reconstruct(
     config: &PoissonConfig,
     memory_budget: MemoryBudget,
 ) -> Result<Reconstruction, MeshingError> {
+    reconstruct_resolved(cloud, config, |_| 0.0, memory_budget)
+}
+
+/// As [`reconstruct`], with cells that are at least half of the `resolution_m` at their position [m].
+///
+/// # Errors
+/// As [`reconstruct`].
+pub fn reconstruct_resolved(
+    cloud: &PointCloud,
+    config: &PoissonConfig,
+    resolution_m: impl Fn(Vec3) -> f32 + Sync,
+    memory_budget: MemoryBudget,
+) -> Result<Reconstruction, MeshingError> {
     config.validate()?;
-    let samples = Samples::new(cloud, config.depth, config.scale)?;
+    let samples = Samples::new(cloud, config)?;
     let cell_m = samples.cell_m();
     if cell_m > MAX_CELL_M {
         return Err(MeshingError::CellsTooLarge {
             extent_m: samples.side_m / config.scale,
             cell_m,
             limit_m: MAX_CELL_M,
-            depth: config.depth,
+            depth: samples.depth,
         });
     }
-    let kernel_depth = config.depth.saturating_sub(KERNEL_LEVELS).max(2);
+    let kernel_depth = samples.depth.saturating_sub(KERNEL_LEVELS).max(2);
     let density = DensityField::new(&samples, kernel_depth, config.samples_per_node);
     let depths = density.sample_depths(&samples);
-    let tree = Octree::build(&samples, config.depth, |sample, depth| {
-        depths[sample] > (depth - 1) as f32
+    let finest: Vec<f32> = (samples.positions.par_iter())
+        .zip(&depths)
+        .map(|(&position, &depth)| {
+            let cells = (resolution_m(samples.to_cloud(position)) / cell_m).max(1.0);
+            depth.min(samples.depth as f32 - cells.log2())
+        })
+        .collect();
+    let tree = Octree::build(&samples, samples.depth, |sample, depth| {
+        finest[sample] > (depth - 1) as f32
     });
     require_memory(&tree, &samples, memory_budget)?;
-    let values = solve(&samples, &depths, &tree, config);
+    let values = solve(&samples, [&depths, &finest], &tree, config);
     let function = NodalFunction {
         tree: &tree,
         values: &values,
@@ -150,17 +178,18 @@ fn require_memory(
 /// The values of χ at the corners of all nodes, per level.
 fn solve(
     samples: &Samples,
-    depths: &[f32],
+    depths: [&[f32]; 2],
     tree: &Octree,
     config: &PoissonConfig,
 ) -> Vec<Vec<CornerValues>> {
     let base = &tree.levels[0];
     // Samples that are sparser than the base level are splatted at the base level.
-    let depths: Vec<f32> = (depths.iter())
-        .map(|depth| depth.max(base.depth as f32))
-        .collect();
+    let [depths, finest] = depths.map(|depths| -> Vec<f32> {
+        (depths.iter().map(|depth| depth.max(base.depth as f32))).collect()
+    });
     let weights = SampleWeights {
         depths: &depths,
+        finest: &finest,
         samples_per_node: config.samples_per_node,
         point_weight: config.point_weight,
     };

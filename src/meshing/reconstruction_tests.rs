@@ -10,7 +10,7 @@ use crate::memory::MemoryBudget;
 
 fn at_depth(depth: u32) -> PoissonConfig {
     PoissonConfig {
-        depth,
+        depth: Some(depth),
         ..PoissonConfig::default()
     }
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use glam::Vec3;
 
 use super::shapes_for_tests::{Topology, street};
-use super::{PoissonConfig, reconstruct, simplify_ground};
+use super::{PoissonConfig, reconstruct, simplify};
 use crate::geometry::{Aabb, TriangleMesh};
 use crate::memory::MemoryBudget;
 
@@ -41,7 +41,7 @@ fn field(cells: u32) -> (TriangleMesh, Vec<bool>) {
 /// The reconstruction of a street with 1 cm of noise, and its ground.
 fn noisy_street() -> (TriangleMesh, Vec<bool>) {
     let config = PoissonConfig {
-        depth: 8,
+        depth: Some(8),
         ..PoissonConfig::default()
     };
     let mesh = reconstruct(&street(100_000, 0.01, 5), &config, MemoryBudget::default())
@@ -69,7 +69,7 @@ fn ground_vertices(mesh: &TriangleMesh, is_ground: &[bool]) -> Vec<Vec3> {
 fn the_ground_loses_four_fifths_of_its_triangles_with_an_error_below_a_centimeter() {
     for (name, (mesh, is_ground)) in [("field", field(100)), ("street", noisy_street())] {
         for smoothing in [0, 1, 4] {
-            let simple = simplify_ground(&mesh, &is_ground, &[], 1.0, smoothing);
+            let simple = simplify(&mesh, &is_ground, &[], 1.0, smoothing);
             let ground = is_ground.iter().filter(|&&is_ground| is_ground).count();
             let left = simple.triangles.len() + ground - mesh.triangles.len();
             assert!(5 * left <= ground, "{name} {smoothing}: {left} of {ground}");
@@ -85,7 +85,7 @@ fn the_ground_loses_four_fifths_of_its_triangles_with_an_error_below_a_centimete
 #[test]
 fn other_triangles_and_the_topology_are_unchanged() {
     for (mesh, is_ground) in [field(60), noisy_street()] {
-        let simple = simplify_ground(&mesh, &is_ground, &[], 1.0, 1);
+        let simple = simplify(&mesh, &is_ground, &[], 1.0, 1);
         let [before, after] = [&mesh, &simple].map(Topology::of);
         assert!(after.is_manifold() || !before.is_manifold());
         assert_eq!(before.euler, after.euler);
@@ -131,7 +131,7 @@ fn island() -> TriangleMesh {
 fn an_almost_straight_boundary_is_simplified_within_its_tolerance() {
     let mesh = island();
     let all = vec![true; mesh.triangles.len()];
-    let simple = simplify_ground(&mesh, &all, &[], 1.0, 0);
+    let simple = simplify(&mesh, &all, &[], 1.0, 0);
     let [before, after] = [&mesh, &simple].map(Topology::of);
     assert_eq!((before.open_edges, before.euler), (400, 1));
     // The teeth of 10 cm remain; the other sides keep at most a third of their vertices.
@@ -154,7 +154,7 @@ fn fixed_vertices_remain_on_the_boundary_and_inside() {
     let mesh = island();
     let all = vec![true; mesh.triangles.len()];
     let fixed: Vec<bool> = mesh.vertices.iter().map(|vertex| vertex.y < 3.0).collect();
-    let simple = simplify_ground(&mesh, &all, &fixed, 1.0, 3);
+    let simple = simplify(&mesh, &all, &fixed, 1.0, 3);
     let left: BTreeSet<_> = (simple.vertices.iter())
         .map(|vertex| vertex.to_array().map(f32::to_bits))
         .collect();
@@ -180,7 +180,7 @@ fn new_triangles_are_level_and_their_edges_within_the_limit() {
         .map(|triangle| bits(mesh.corners(triangle)))
         .collect();
     for resolution_m in [0.5, 1.0] {
-        let simple = simplify_ground(&mesh, &is_ground, &[], resolution_m, 0);
+        let simple = simplify(&mesh, &is_ground, &[], resolution_m, 0);
         let new: Vec<usize> = (0..simple.triangles.len())
             .filter(|&triangle| !old.contains(&bits(simple.corners(triangle))))
             .collect();
@@ -205,7 +205,7 @@ fn smoothing_flips_no_triangle() {
             .count()
     };
     for iterations in [1, 4] {
-        let simple = simplify_ground(&mesh, &is_ground, &[], 1.0, iterations);
+        let simple = simplify(&mesh, &is_ground, &[], 1.0, iterations);
         assert!(
             turned(&simple) <= turned(&mesh),
             "{} {}",
@@ -218,7 +218,7 @@ fn smoothing_flips_no_triangle() {
 #[test]
 fn block_boundaries_leave_no_denser_seams() {
     let mesh = square(160, |_, _| 0.0);
-    let simple = simplify_ground(&mesh, &vec![true; mesh.triangles.len()], &[], 1.0, 0);
+    let simple = simplify(&mesh, &vec![true; mesh.triangles.len()], &[], 1.0, 0);
     // Counts in squares of 1 m away from the boundary.
     let mut counts = [[0; 16]; 16];
     for triangle in 0..simple.triangles.len() {
@@ -239,7 +239,7 @@ fn block_boundaries_leave_no_denser_seams() {
 fn a_bump_above_the_tolerance_remains() {
     let is_bump = |x: f32, y: f32| (x - 7.0).abs() < 0.01 && (y - 12.0).abs() < 0.01;
     let mesh = square(100, |x, y| if is_bump(x, y) { 0.03 } else { 0.0 });
-    let simple = simplify_ground(&mesh, &vec![true; mesh.triangles.len()], &[], 1.0, 0);
+    let simple = simplify(&mesh, &vec![true; mesh.triangles.len()], &[], 1.0, 0);
     assert!(simple.triangles.len() < mesh.triangles.len() / 5);
     assert!(simple.vertices.iter().any(|v| is_bump(v.x, v.y)));
 }
@@ -249,7 +249,7 @@ fn the_result_does_not_depend_on_the_number_of_threads() {
     let (mesh, is_ground) = field(80);
     let with_threads = |count: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build();
-        let simplified = || simplify_ground(&mesh, &is_ground, &[], 1.0, 1);
+        let simplified = || simplify(&mesh, &is_ground, &[], 1.0, 1);
         pool.unwrap().install(simplified)
     };
     assert_eq!(with_threads(1), with_threads(2));
@@ -259,7 +259,7 @@ fn the_result_does_not_depend_on_the_number_of_threads() {
 fn without_ground_nothing_changes() {
     let (mesh, is_ground) = field(10);
     assert_eq!(
-        simplify_ground(&mesh, &vec![false; is_ground.len()], &[], 1.0, 3),
+        simplify(&mesh, &vec![false; is_ground.len()], &[], 1.0, 3),
         mesh
     );
 }

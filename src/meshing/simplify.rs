@@ -1,4 +1,4 @@
-//! Simplification of the ground, block by block.
+//! Simplification of a part of a mesh, such as the ground, block by block.
 //!
 //! The plane is divided into square blocks that are simplified independently and in parallel, see
 //! `collapse`; then twice again with blocks shifted by a third and two thirds, so that every
@@ -19,37 +19,37 @@ const MAX_DISPLACEMENT_M: f32 = 0.005;
 /// Triangle of a vertex that is not removed.
 const NONE: u32 = u32::MAX;
 
-/// Simplifies the ground: new edges are up to `resolution_m` long, and every original vertex is within
-/// a centimeter of the remaining surface. Before, interior ground vertices are smoothed
+/// Simplifies a part of a mesh: new edges are up to `resolution_m` long, and every original vertex is within
+/// a centimeter of the remaining surface. Before, interior vertices of the part are smoothed
 /// `smoothing_iterations` times, halfway to the mean of their neighbors along their normals, by at most
 /// five millimeters in total; the centimeter includes that.
 ///
-/// `is_ground` is per triangle, `is_fixed` per vertex; both count as false beyond their ends. Fixed
+/// `is_part` is per triangle, `is_fixed` per vertex; both count as false beyond their ends. Fixed
 /// vertices and vertices of other triangles do not move. The boundary moves by at most two
 /// centimeters. Normals and colors are kept; unreferenced vertices are removed.
-pub fn simplify_ground(
+pub fn simplify(
     mesh: &TriangleMesh,
-    is_ground: &[bool],
+    is_part: &[bool],
     is_fixed: &[bool],
     resolution_m: f32,
     smoothing_iterations: usize,
 ) -> TriangleMesh {
-    let mut ground = Ground::new(mesh.clone(), is_ground, is_fixed);
-    ground.smooth(smoothing_iterations);
+    let mut part = Part::new(mesh.clone(), is_part, is_fixed);
+    part.smooth(smoothing_iterations);
     for third in 0..3 {
-        ground.simplify_blocks(third as f32 / 3.0 * BLOCK_M, resolution_m);
+        part.simplify_blocks(third as f32 / 3.0 * BLOCK_M, resolution_m);
     }
-    let mut mesh = ground.mesh;
+    let mut mesh = part.mesh;
     mesh.triangles.retain(|triangle| *triangle != REMOVED);
     mesh.drop_unreferenced_vertices();
     mesh
 }
 
-struct Ground {
+struct Part {
     mesh: TriangleMesh,
-    /// Whether a vertex has a ground triangle.
-    is_ground: Vec<bool>,
-    /// Kinds of the vertices; free ones have only ground triangles.
+    /// Whether a vertex has a triangle of the part.
+    is_part: Vec<bool>,
+    /// Kinds of the vertices; free ones have only triangles of the part.
     kinds: Vec<VertexKind>,
     /// Whether a vertex was originally on the boundary and free.
     is_boundary: Vec<bool>,
@@ -59,15 +59,15 @@ struct Ground {
     removed_on: Vec<u32>,
 }
 
-impl Ground {
-    fn new(mesh: TriangleMesh, is_ground: &[bool], is_fixed: &[bool]) -> Self {
+impl Part {
+    fn new(mesh: TriangleMesh, is_part: &[bool], is_fixed: &[bool]) -> Self {
         let count = mesh.vertices.len();
-        let (mut in_ground, mut in_rest) = (vec![false; count], vec![false; count]);
+        let (mut in_part, mut in_rest) = (vec![false; count], vec![false; count]);
         for (index, triangle) in mesh.triangles.iter().enumerate() {
-            let is_ground = is_ground.get(index).copied().unwrap_or(false);
+            let is_part = is_part.get(index).copied().unwrap_or(false);
             for &vertex in triangle {
-                in_ground[vertex as usize] |= is_ground;
-                in_rest[vertex as usize] |= !is_ground;
+                in_part[vertex as usize] |= is_part;
+                in_rest[vertex as usize] |= !is_part;
             }
         }
         let corners = VertexCorners::new(&mesh.triangles, count);
@@ -76,7 +76,7 @@ impl Ground {
             .map_init(Vec::new, |edges, vertex| {
                 let is_fixed = is_fixed.get(vertex).copied().unwrap_or(false);
                 edges.clear();
-                if in_ground[vertex] && !in_rest[vertex] && !is_fixed {
+                if in_part[vertex] && !in_rest[vertex] && !is_fixed {
                     let corners = corners.of(vertex).iter();
                     edges.extend(corners.map(|&corner| opposite_edge(&mesh.triangles, corner)));
                 }
@@ -86,7 +86,7 @@ impl Ground {
         Self {
             is_boundary: kinds.iter().map(|&k| k == VertexKind::Boundary).collect(),
             kinds,
-            is_ground: in_ground,
+            is_part: in_part,
             originals: mesh.vertices.clone(),
             removed_on: vec![NONE; count],
             mesh,
@@ -136,7 +136,7 @@ impl Ground {
             .collect();
         let members = self.block_members(&block_of);
         let removed = self.removed_by_triangle();
-        let blocks: Vec<GroundBlock> = members
+        let blocks: Vec<Block> = members
             .par_chunk_by(|a, b| a.0 == b.0)
             .map(|members| {
                 let mut block = self.extract_block(members, &block_of, &removed);
@@ -149,11 +149,11 @@ impl Ground {
         }
     }
 
-    /// The triangles at ground vertices by the blocks of their vertices, so that every block has
+    /// The triangles at vertices of the part by the blocks of their vertices, so that every block has
     /// complete rings.
     fn block_members(&self, block_of: &[IVec2]) -> Vec<([i32; 2], u32)> {
         let mut members: Vec<_> = (self.mesh.triangles.par_iter().enumerate())
-            .filter(|(_, t)| **t != REMOVED && t.iter().any(|&v| self.is_ground[v as usize]))
+            .filter(|(_, t)| **t != REMOVED && t.iter().any(|&v| self.is_part[v as usize]))
             .flat_map_iter(|(index, triangle)| {
                 let [a, b, c] = triangle.map(|v| block_of[v as usize].to_array());
                 let (second, third) = (b != a, c != a && c != b);
@@ -181,7 +181,7 @@ impl Ground {
         members: &[([i32; 2], u32)],
         block_of: &[IVec2],
         removed: &[(u32, u32)],
-    ) -> GroundBlock {
+    ) -> Block {
         let triangles: Vec<u32> = members.iter().map(|&(_, triangle)| triangle).collect();
         let corners = |&triangle: &u32| self.mesh.triangles[triangle as usize];
         let mut vertices: Vec<u32> = triangles.iter().flat_map(corners).collect();
@@ -218,14 +218,14 @@ impl Ground {
             locals,
             &removed_on,
         );
-        GroundBlock {
+        Block {
             submesh,
             vertices,
             triangles,
         }
     }
 
-    fn insert_block(&mut self, block: &GroundBlock) {
+    fn insert_block(&mut self, block: &Block) {
         for (&triangle, &corners) in block.triangles.iter().zip(block.submesh.triangles()) {
             self.mesh.triangles[triangle as usize] = if corners == REMOVED {
                 REMOVED
@@ -242,7 +242,7 @@ impl Ground {
 }
 
 /// The submesh of a block, and the indices of its vertices and triangles in the whole mesh.
-struct GroundBlock {
+struct Block {
     submesh: Submesh,
     vertices: Vec<u32>,
     triangles: Vec<u32>,

@@ -15,12 +15,17 @@ pub fn trim_by_density(mesh: &mut TriangleMesh, densities: &[f32], quantile: f64
     mesh.retain_triangles(|_, triangle| triangle.iter().all(|&v| densities[v as usize] >= limit))
 }
 
-/// Removes the triangles with a vertex farther than `max_distance_m` from every sample; returns their
-/// number.
-pub fn trim_by_distance(mesh: &mut TriangleMesh, samples: &[Vec3], max_distance_m: f32) -> usize {
-    let grid = SampleGrid::new(samples, max_distance_m);
+/// Removes the triangles with a vertex farther than the largest distance at its position [m] from every sample; returns
+/// their number. No distance is less than `least_m`.
+pub fn trim_by_distance(
+    mesh: &mut TriangleMesh,
+    samples: &[Vec3],
+    least_m: f32,
+    largest_m: impl Fn(Vec3) -> f32 + Sync,
+) -> usize {
+    let grid = SampleGrid::new(samples, least_m);
     let is_near: Vec<bool> = (mesh.vertices.par_iter())
-        .map(|&vertex| grid.has_sample_near(vertex))
+        .map(|&vertex| grid.has_sample_within(vertex, largest_m(vertex).max(least_m)))
         .collect();
     mesh.retain_triangles(|_, triangle| triangle.iter().all(|&v| is_near[v as usize]))
 }
@@ -35,32 +40,34 @@ fn quantile_of(values: &[f32], quantile: f64) -> Option<f32> {
     Some(low + (high - low) * position.fract() as f32)
 }
 
-/// Samples in grid cells whose edge is the search radius.
+/// Samples in grid cells.
 struct SampleGrid {
     /// Cell and position of each sample, ascending in cell.
     samples: Vec<([i32; 3], Vec3)>,
-    radius_m: f32,
+    cell_m: f32,
 }
 
 impl SampleGrid {
-    fn new(samples: &[Vec3], radius_m: f32) -> Self {
+    fn new(samples: &[Vec3], cell_m: f32) -> Self {
         let mut samples: Vec<_> = (samples.par_iter())
             .filter(|sample| sample.is_finite())
-            .map(|&sample| (cell_of(sample, radius_m), sample))
+            .map(|&sample| (cell_of(sample, cell_m), sample))
             .collect();
         samples.par_sort_unstable_by_key(|&(cell, _)| cell);
-        Self { samples, radius_m }
+        Self { samples, cell_m }
     }
 
-    fn has_sample_near(&self, point: Vec3) -> bool {
-        let [x, y, z] = cell_of(point, self.radius_m);
-        (0..9).any(|i| {
-            // Three cells along z are contiguous.
-            let [x, y] = [x + i % 3 - 1, y + i / 3 - 1];
-            let start = (self.samples).partition_point(|&(cell, _)| cell < [x, y, z - 1]);
-            (self.samples[start..].iter())
-                .take_while(|&&(cell, _)| cell <= [x, y, z + 1])
-                .any(|(_, s)| s.distance_squared(point) <= self.radius_m * self.radius_m)
+    fn has_sample_within(&self, point: Vec3, radius_m: f32) -> bool {
+        let [first, last] =
+            [-radius_m, radius_m].map(|offset| cell_of(point + offset, self.cell_m));
+        (first[0]..=last[0]).any(|x| {
+            (first[1]..=last[1]).any(|y| {
+                // Cells along z are contiguous.
+                let start = (self.samples).partition_point(|&(cell, _)| cell < [x, y, first[2]]);
+                (self.samples[start..].iter())
+                    .take_while(|&&(cell, _)| cell <= [x, y, last[2]])
+                    .any(|(_, sample)| sample.distance_squared(point) <= radius_m * radius_m)
+            })
         })
     }
 }
@@ -113,10 +120,10 @@ mod tests {
     fn triangles_remain_if_all_their_vertices_are_near_a_sample() {
         let mut mesh = strip(20);
         let samples: Vec<Vec3> = (0..5).map(|x| Vec3::new(x as f32, 0.5, 0.0)).collect();
-        let dropped = trim_by_distance(&mut mesh, &samples, 0.51);
+        let dropped = trim_by_distance(&mut mesh, &samples, 0.51, |_| 0.0);
         assert_eq!(dropped, 38 - 8);
         assert!(mesh.vertices.iter().all(|vertex| vertex.x <= 4.0));
-        assert_eq!(trim_by_distance(&mut mesh, &[], 0.5), 8);
+        assert_eq!(trim_by_distance(&mut mesh, &[], 0.5, |_| 0.0), 8);
         assert!(mesh.vertices.is_empty());
     }
 }

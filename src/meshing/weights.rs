@@ -6,6 +6,8 @@ use super::stencil::{interpolate, trilinear};
 pub struct SampleWeights<'a> {
     /// Depth at which a cell face holds `samples_per_node` samples, per sample.
     pub depths: &'a [f32],
+    /// Depth of the finest cells at each sample, at most as above.
+    pub finest: &'a [f32],
     /// Number of samples per cell face at a sample's depth.
     pub samples_per_node: f32,
     /// Screening weight α.
@@ -29,7 +31,7 @@ impl SampleWeights<'_> {
     /// Fraction of a sample's normal that is splatted at this depth or finer.
     #[inline]
     pub fn fraction_from(&self, sample: usize, depth: u32) -> f32 {
-        (self.depths[sample] - depth as f32 + 1.0).clamp(0.0, 1.0)
+        (self.finest[sample] - depth as f32 + 1.0).clamp(0.0, 1.0)
     }
 }
 

@@ -345,7 +345,7 @@ mod tests {
         let other = keys(|run| run.localization.tracker.seed = 9);
         assert!(other.run != same.run && other.localization != same.localization);
         assert_eq!(other.map, same.map);
-        let other = keys(|run| run.build_map.map.local_map.poisson.depth = 7);
+        let other = keys(|run| run.build_map.map.local_map.poisson.depth = Some(7));
         assert!(other.run != same.run && other.localization != same.localization);
         assert_ne!(other.map, same.map);
         let other = keys(|run| {

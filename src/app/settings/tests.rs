@@ -371,9 +371,9 @@ crop_x: 20
 ";
     let config: BuildMapConfig = load_text(text, &[]).unwrap();
     let mut expected = BuildMapConfig::default();
-    expected.map.local_map.poisson.depth = 8;
+    expected.map.local_map.poisson.depth = Some(8);
     expected.map.local_map.voxel_size_m = 0.2;
-    expected.map.local_map.crop_x_m = 20.0;
+    expected.map.local_map.crop_x_m = Some(20.0);
     expected.map.ground.method = crate::ground::GroundMethod::Pca;
     expected.map.ground.pca.min_cosine = 0.9;
     assert_eq!(config, expected);

@@ -249,7 +249,7 @@ impl MapBuilder {
         }
         path_check::check(map_from_lidar.iter().enumerate(), config.max_step_m)?;
         let local_maps = plan::local_maps(&map_from_lidar, config.local_map_size, config.overlap_m);
-        let reach_m = f64::from(config.local_map.crop_m().length());
+        let reach_m = f64::from(config.local_map.crop_m(&sensor.range_image).length());
         let budget = self.options.memory_budget;
         Ownership::require_memory(&map_from_lidar, &local_maps, reach_m, budget)?;
         require_memory_of_images(&sensor.range_image, budget)?;
@@ -422,9 +422,9 @@ mod tests {
             overlap_m: 1.5,
             ..MapConfig::default()
         };
-        config.local_map.poisson.depth = 5;
+        config.local_map.poisson.depth = Some(5);
         config.local_map.max_distance_m = 1.0;
-        (config.local_map.crop_x_m, config.local_map.crop_y_m) = (10.0, 10.0);
+        (config.local_map.crop_x_m, config.local_map.crop_y_m) = (Some(10.0), Some(10.0));
         MapBuilder {
             sensor: Some(Sensor::new(model())),
             options: MapOptions {
@@ -495,7 +495,7 @@ mod tests {
     #[test]
     fn a_newer_drive_adds_what_is_new_removes_what_is_gone_and_keeps_the_rest() {
         let mut builder = builder();
-        builder.config.local_map.poisson.depth = 7;
+        builder.config.local_map.poisson.depth = Some(7);
         builder.config.local_map.max_distance_m = 0.3;
         let map_of = |is_there| builder.build(drive_towards_panel(is_there)).unwrap();
         let (empty, blocked) = (map_of(false), map_of(true));

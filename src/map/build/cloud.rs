@@ -257,7 +257,7 @@ mod tests {
             min_density: 0.0,
             ..LocalMapConfig::default()
         };
-        config.poisson.depth = 7;
+        config.poisson.depth = Some(7);
         config.max_distance_m = 0.5;
         config
     }

@@ -1,6 +1,7 @@
 //! A local map: the mesh of the scans of a stretch of road.
 
 use glam::{DVec3, Vec3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
@@ -8,9 +9,9 @@ use super::changes::{self, Changes};
 use super::plan::Domain;
 use super::scan_cloud::{PointCounts, ScanCloud, ScanPreparation};
 use super::seam;
-use super::vertex_ground;
+use super::vertex_ground::{self, GroundConfidences};
 use super::visibility::{self, VisibilityConfig};
-use crate::geometry::{PointCloud, TriangleMesh};
+use crate::geometry::{KdTree, PointCloud, TriangleMesh};
 use crate::lidar::{LidarModel, NormalConfig};
 use crate::map::mesh_view::MeshView;
 use crate::memory::MemoryBudget;
@@ -18,9 +19,13 @@ use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
 use crate::sensor::Sensor;
 use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, require};
 
-/// Longest edge of the simplified ground in cells: vertices of neighbouring cells are less than two
+/// Longest edge of the simplified surface in cells: vertices of neighbouring cells are less than two
 /// cells apart along an axis.
 const CELLS_PER_EDGE: f32 = 2.0;
+
+/// Least angle under which a cell is seen from the path [rad]: 0.9 degrees. With half of it a map has a third more triangles
+/// and the same errors, with one and a half times it the errors begin to grow; docs/method.md has the table.
+const CELL_RAD: f32 = 1.0 / 64.0;
 
 /// Processing of scans into a mesh.
 ///
@@ -34,15 +39,12 @@ pub struct LocalMapConfig {
     /// Edge of the voxels for downsampling, in the lidar frame [m].
     #[default(0.1)]
     pub voxel_size_m: f32,
-    /// Half length of the box around the sensor in which points are kept [m].
-    #[default(30.0)]
-    pub crop_x_m: f32,
-    /// Half width of that box [m].
-    #[default(30.0)]
-    pub crop_y_m: f32,
-    /// Half height of that box [m].
-    #[default(5.0)]
-    pub crop_z_m: f32,
+    /// Half length of the box around the sensor in which points are kept [m]; null: the range of the sensor.
+    pub crop_x_m: Option<f32>,
+    /// Half width of that box [m]; null: the range of the sensor.
+    pub crop_y_m: Option<f32>,
+    /// Half height of that box [m]; null: the range of the sensor.
+    pub crop_z_m: Option<f32>,
     /// Surface reconstruction.
     pub poisson: PoissonConfig,
     /// Vertices below this quantile of density are removed (unitless).
@@ -56,7 +58,7 @@ pub struct LocalMapConfig {
     /// A vertex with at least this ground confidence is ground (unitless).
     #[default(0.5)]
     pub ground_threshold: f32,
-    /// Cell size of the simplification of the ground [m]: no new edge is longer than two cells; 0
+    /// Cell size of the simplification [m]: no new edge is longer than two cells; 0
     /// disables it.
     #[default(1.0)]
     pub simplify_resolution_m: f32,
@@ -75,9 +77,10 @@ pub struct LocalMapConfig {
 const MAX_CROP_M: f32 = 500.0;
 
 impl LocalMapConfig {
-    /// Half extent of the box around the sensor in which points are kept [m].
-    pub(crate) fn crop_m(&self) -> Vec3 {
-        Vec3::new(self.crop_x_m, self.crop_y_m, self.crop_z_m)
+    /// Half extent of the box around a sensor in which points are kept [m].
+    pub(crate) fn crop_m(&self, sensor: &LidarModel) -> Vec3 {
+        let extent_m = [self.crop_x_m, self.crop_y_m, self.crop_z_m];
+        Vec3::from(extent_m.map(|m| m.unwrap_or(sensor.max_range)))
     }
 
     /// How scans of a sensor are prepared.
@@ -86,7 +89,7 @@ impl LocalMapConfig {
             sensor: sensor.clone(),
             normals: self.normals,
             voxel_size_m: self.voxel_size_m,
-            crop_m: self.crop_m(),
+            crop_m: self.crop_m(&sensor.range_image),
         }
     }
 }
@@ -104,9 +107,14 @@ impl Validate for LocalMapConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("normals", &self.normals)?;
         in_range("voxel_size_m", self.voxel_size_m, 0.001..=100.0)?;
-        in_range("crop_x_m", self.crop_x_m, 0.001..=MAX_CROP_M)?;
-        in_range("crop_y_m", self.crop_y_m, 0.001..=MAX_CROP_M)?;
-        in_range("crop_z_m", self.crop_z_m, 0.001..=MAX_CROP_M)?;
+        let crop = [
+            ("crop_x_m", self.crop_x_m),
+            ("crop_y_m", self.crop_y_m),
+            ("crop_z_m", self.crop_z_m),
+        ];
+        for (key, extent_m) in crop {
+            in_range(key, extent_m.unwrap_or(MAX_CROP_M), 0.001..=MAX_CROP_M)?;
+        }
         nested("poisson", &self.poisson)?;
         require(
             (0.0..1.0).contains(&self.min_density),
@@ -153,7 +161,7 @@ pub struct LocalMapCounts {
     pub distant_triangles: usize,
     /// Triangles removed because beams pass through them.
     pub crossed_triangles: usize,
-    /// Triangles saved by simplifying the ground.
+    /// Triangles saved by simplification.
     pub simplified_triangles: usize,
     /// Triangles in regions of neighbouring local maps.
     pub foreign_triangles: usize,
@@ -222,7 +230,8 @@ pub(crate) fn build<E: From<MeshingError>>(
     let cloud = static_cloud(&scans, model, config, &mut counts);
 
     begin_stage("surface")?;
-    let Some(mut mesh) = surface(&cloud, config, budget, &mut counts)? else {
+    let resolution_m = resolution_around(&scans, config);
+    let Some(mut mesh) = surface(&cloud, config, resolution_m, budget, &mut counts)? else {
         return Ok(LocalMap {
             counts,
             ..LocalMap::default()
@@ -260,7 +269,7 @@ pub(crate) fn build_of_cloud<E: From<MeshingError>>(
 ) -> Result<LocalMap, E> {
     let mut counts = LocalMapCounts::default();
     begin_stage("surface")?;
-    let Some(mesh) = surface(cloud, config, budget, &mut counts)? else {
+    let Some(mesh) = surface(cloud, config, |_| 0.0, budget, &mut counts)? else {
         return Ok(LocalMap {
             counts,
             ..LocalMap::default()
@@ -270,29 +279,59 @@ pub(crate) fn build_of_cloud<E: From<MeshingError>>(
     Ok(finish(mesh, cloud, domain, config, counts))
 }
 
+/// The size of the cells by their distance from the nearest scan [m]; all are of the finest where a depth is given.
+fn resolution_around(
+    scans: &[ScanCloud],
+    config: &LocalMapConfig,
+) -> impl Fn(Vec3) -> f32 + Sync + use<> {
+    let level = |point: Vec3| Vec3::new(point.x, point.y, 0.0);
+    let path: Vec<Vec3> = (scans.iter())
+        .map(|scan| level(scan.map_from_lidar.translation))
+        .collect();
+    let path = config.poisson.depth.is_none().then(|| KdTree::new(&path));
+    move |position| {
+        let mut nearest = Vec::with_capacity(1);
+        if let Some(path) = &path {
+            path.nearest(level(position), 1, &mut nearest);
+        }
+        nearest
+            .first()
+            .map_or(0.0, |(squared, _)| CELL_RAD * squared.sqrt())
+    }
+}
+
 /// Reconstructs and trims the surface; `None` where there are too few points.
 fn surface(
     cloud: &PointCloud,
     config: &LocalMapConfig,
+    resolution_m: impl Fn(Vec3) -> f32 + Sync,
     budget: MemoryBudget,
     counts: &mut LocalMapCounts,
 ) -> Result<Option<TriangleMesh>, MeshingError> {
     let Some(Reconstruction {
         mut mesh,
-        densities,
+        mut densities,
+        cell_m,
         ..
-    }) = reconstruct(cloud, config, budget, counts)?
+    }) = reconstruct(cloud, config, &resolution_m, budget, counts)?
     else {
         return Ok(None);
     };
     counts.reconstructed_triangles = mesh.triangles.len();
+    // Sparse is what is sparser than its cells.
+    (densities.par_iter_mut().zip(&mesh.vertices))
+        .for_each(|(depth, &vertex)| *depth += (resolution_m(vertex) / cell_m).max(1.0).log2());
     counts.sparse_triangles = meshing::trim_by_density(&mut mesh, &densities, config.min_density);
-    counts.distant_triangles =
-        meshing::trim_by_distance(&mut mesh, &cloud.positions, config.max_distance_m);
+    counts.distant_triangles = meshing::trim_by_distance(
+        &mut mesh,
+        &cloud.positions,
+        config.max_distance_m,
+        resolution_m,
+    );
     Ok(Some(mesh))
 }
 
-/// Clips a mesh to what a local map owns, and colours and simplifies its ground.
+/// Clips a mesh to what a local map owns, simplifies and colours it.
 fn finish(
     mut mesh: TriangleMesh,
     cloud: &PointCloud,
@@ -303,8 +342,8 @@ fn finish(
     let region = domain.region(&mesh.bounds());
     counts.foreign_triangles = seam::keep_own(&mut mesh, &region, domain.origin);
     meshing::split_fans(&mut mesh);
-    let is_held = seam::on_border(&mesh.vertices, &region, domain.origin);
-    finish_ground(&mut mesh, cloud, &is_held, config, &mut counts);
+    let is_held = |mesh: &TriangleMesh| seam::on_border(&mesh.vertices, &region, domain.origin);
+    simplify_and_colour(&mut mesh, cloud, is_held, config, &mut counts);
     mesh.snap();
     counts.triangles = mesh.triangles.len();
     LocalMap {
@@ -343,10 +382,11 @@ fn static_cloud(
 fn reconstruct(
     cloud: &PointCloud,
     config: &LocalMapConfig,
+    resolution_m: impl Fn(Vec3) -> f32 + Sync,
     budget: MemoryBudget,
     counts: &mut LocalMapCounts,
 ) -> Result<Option<Reconstruction>, MeshingError> {
-    match meshing::reconstruct(cloud, &config.poisson, budget) {
+    match meshing::reconstruct_resolved(cloud, &config.poisson, resolution_m, budget) {
         Ok(surface) => {
             counts.unusable_points = surface.dropped_points;
             counts.cell_m = surface.cell_m;
@@ -361,35 +401,33 @@ fn reconstruct(
     }
 }
 
-/// Colours the mesh by ground confidence and simplifies its ground, apart from the held vertices.
-fn finish_ground(
+/// Simplifies the ground and the rest, apart from vertices on the border of the region and between both, and colours the mesh by
+/// ground confidence.
+fn simplify_and_colour(
     mesh: &mut TriangleMesh,
     cloud: &PointCloud,
-    is_held: &[bool],
+    is_held: impl Fn(&TriangleMesh) -> Vec<bool>,
     config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
 ) {
     let cell_m = config.max_distance_m.max(2.0 * config.voxel_size_m);
-    let confidences = vertex_ground::mean_confidences(&mesh.vertices, cloud, cell_m);
+    let confidences = GroundConfidences::new(cloud, cell_m);
     let threshold = config.ground_threshold;
+    let before = mesh.triangles.len();
+    if config.simplify_resolution_m > 0.0 {
+        let edge_m = CELLS_PER_EDGE * config.simplify_resolution_m;
+        for (of_ground, smoothing_iterations) in [(false, 0), (true, config.smoothing_iterations)] {
+            let vertices = confidences.of(&mesh.vertices);
+            let is_ground = vertex_ground::ground_triangles(mesh, &vertices, threshold);
+            let is_part: Vec<bool> = is_ground.iter().map(|&it| it == of_ground).collect();
+            *mesh = meshing::simplify(mesh, &is_part, &is_held(mesh), edge_m, smoothing_iterations);
+        }
+    }
+    counts.simplified_triangles = before.saturating_sub(mesh.triangles.len());
     let byte = |share: f64| (255.0 * share).round() as u8;
     let (rest, ground) = (config.rest_color.map(byte), config.ground_color.map(byte));
-    mesh.colors = confidences
-        .iter()
-        .map(|&confidence| vertex_ground::color(confidence, threshold, rest, ground))
-        .collect();
-    if config.simplify_resolution_m <= 0.0 {
-        return;
-    }
-    let before = mesh.triangles.len();
-    *mesh = meshing::simplify_ground(
-        mesh,
-        &vertex_ground::ground_triangles(mesh, &confidences, threshold),
-        is_held,
-        CELLS_PER_EDGE * config.simplify_resolution_m,
-        config.smoothing_iterations,
-    );
-    counts.simplified_triangles = before.saturating_sub(mesh.triangles.len());
+    let color = |&confidence: &f32| vertex_ground::color(confidence, threshold, rest, ground);
+    mesh.colors = confidences.of(&mesh.vertices).iter().map(color).collect();
 }
 
 #[cfg(test)]
@@ -416,12 +454,13 @@ mod tests {
         let mut counts = LocalMapCounts::default();
         let settings = LocalMapConfig {
             poisson: PoissonConfig {
-                depth: 5,
+                depth: Some(5),
                 ..PoissonConfig::default()
             },
             ..LocalMapConfig::default()
         };
-        let surface = reconstruct(cloud, &settings, MemoryBudget::default(), &mut counts).unwrap();
+        let budget = MemoryBudget::default();
+        let surface = reconstruct(cloud, &settings, |_| 0.0, budget, &mut counts).unwrap();
         assert_eq!(surface.is_none(), counts.is_empty);
         (counts.is_empty, counts.unusable_points)
     }

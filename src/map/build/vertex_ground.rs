@@ -18,33 +18,50 @@ pub(crate) const REST: [u8; 3] = [0, 0, 255];
 /// bytes.
 const MIN_CONTRAST: f32 = 0.01;
 
-/// Returns per vertex the mean ground confidence, 0 to 1, of the points in its cell, or else in the
-/// cells around it; 0 where there are none.
-pub(crate) fn mean_confidences(vertices: &[Vec3], cloud: &PointCloud, cell_m: f32) -> Vec<f32> {
-    let cell_of = |point: Vec3| (point / cell_m).floor().as_ivec3();
-    let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::with_capacity(cloud.len() / 4);
-    for (&position, &ground) in cloud.positions.iter().zip(&cloud.ground) {
-        let cell = cells.entry(cell_of(position)).or_default();
-        cell.0 += ground;
-        cell.1 += 1.0;
+/// Mean ground confidences of points in cells.
+pub(crate) struct GroundConfidences {
+    cell_m: f32,
+    /// Sum and number of the confidences of each cell.
+    cells: HashMap<IVec3, (f32, f32)>,
+}
+
+impl GroundConfidences {
+    /// The means of a cloud in cells of an edge.
+    pub(crate) fn new(cloud: &PointCloud, cell_m: f32) -> Self {
+        let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::with_capacity(cloud.len() / 4);
+        for (&position, &ground) in cloud.positions.iter().zip(&cloud.ground) {
+            let cell = cells.entry(cell_of(position, cell_m)).or_default();
+            cell.0 += ground;
+            cell.1 += 1.0;
+        }
+        Self { cell_m, cells }
     }
-    let around: Vec<IVec3> = (0..27)
-        .map(|i| IVec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1))
-        .collect();
-    vertices
-        .par_iter()
-        .map(|&vertex| {
-            let center = cell_of(vertex);
-            let own = cells.get(&center).copied();
-            let (sum, count) = own.unwrap_or_else(|| {
-                around
-                    .iter()
-                    .filter_map(|offset| cells.get(&(center + offset)))
-                    .fold((0.0, 0.0), |sum, cell| (sum.0 + cell.0, sum.1 + cell.1))
-            });
-            if count > 0.0 { sum / count } else { 0.0 }
-        })
-        .collect()
+
+    /// Returns per vertex the mean ground confidence, 0 to 1, of the points in its cell, or else in the
+    /// cells around it; 0 where there are none.
+    pub(crate) fn of(&self, vertices: &[Vec3]) -> Vec<f32> {
+        let around: Vec<IVec3> = (0..27)
+            .map(|i| IVec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1))
+            .collect();
+        vertices
+            .par_iter()
+            .map(|&vertex| {
+                let center = cell_of(vertex, self.cell_m);
+                let own = self.cells.get(&center).copied();
+                let (sum, count) = own.unwrap_or_else(|| {
+                    around
+                        .iter()
+                        .filter_map(|offset| self.cells.get(&(center + offset)))
+                        .fold((0.0, 0.0), |sum, cell| (sum.0 + cell.0, sum.1 + cell.1))
+                });
+                if count > 0.0 { sum / count } else { 0.0 }
+            })
+            .collect()
+    }
+}
+
+fn cell_of(point: Vec3, cell_m: f32) -> IVec3 {
+    (point / cell_m).floor().as_ivec3()
 }
 
 /// Returns the colour of a confidence: `rest` at 0, `ground` at 1, closer to `ground` exactly from the
@@ -96,7 +113,7 @@ mod tests {
         }
         // In the cell of three points, in the cell of one, next to it, and far from all.
         let vertices = [0.05, 5.2, 5.45, 9.0].map(|x| Vec3::new(x, 0.1, 0.1));
-        let means = mean_confidences(&vertices, &cloud, 0.25);
+        let means = GroundConfidences::new(&cloud, 0.25).of(&vertices);
         for (mean, expected) in means.into_iter().zip([0.7, 0.2, 0.2, 0.0]) {
             assert!((mean - expected).abs() < 1e-6, "{mean} for {expected}");
         }
