@@ -129,10 +129,12 @@ fn rowless(scans: &[Scan]) -> LidarModel {
 
 /// Least and greatest range of a return [m].
 ///
-/// The greatest is 50 m, as far as a map is rendered, or twice the range of nearly all returns in a building. The
+/// The greatest is that of nearly all returns, but at least 50 m, or twice it in a building, whose next room may be larger. The
 /// least is that of nearly all returns apart from the own car, but between 0.3 m, where housings and hands are, and 2 m.
 fn range_limits(scans: &[Scan], [x_min, x_max, y_min, y_max]: [f32; 4]) -> (f32, f32) {
     const NEARLY_ALL: f64 = 0.99;
+    /// Beyond it, points of a scan are farther apart than surfaces are large [m].
+    const FARTHEST_M: f32 = 120.0;
     let is_own = |x: f32, y: f32| x > x_min && x < x_max && y > y_min && y < y_max;
     let mut ranges: Vec<f32> = (scans.iter().flat_map(|scan| &scan.points))
         .filter(|point| !is_own(point.x, point.y))
@@ -142,6 +144,6 @@ fn range_limits(scans: &[Scan], [x_min, x_max, y_min, y_max]: [f32; 4]) -> (f32,
     let farthest = quantile(&mut ranges, NEARLY_ALL);
     (
         (0.9 * nearest).clamp(0.3, 2.0),
-        (2.0 * farthest).clamp(10.0, 50.0),
+        (2.0 * farthest).clamp(10.0, farthest.clamp(50.0, FARTHEST_M)),
     )
 }
