@@ -80,9 +80,7 @@ fn depth_9(bencher: divan::Bencher<'_, '_>, count: usize) {
         depth: Some(9),
         ..PoissonConfig::default()
     };
-    bencher.bench_local(|| {
-        reconstruct(&cloud, &config, MemoryBudget::default()).unwrap()
-    });
+    bencher.bench_local(|| reconstruct(&cloud, &config, MemoryBudget::default()).unwrap());
 }
 
 /// A rectangle of the street: a corner and two edges.

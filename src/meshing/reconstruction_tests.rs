@@ -107,7 +107,7 @@ fn the_hole_in_a_plane_has_a_lower_density_and_is_trimmed_with_it() {
     let mut surface = reconstructed(&cloud, 7);
     let in_hole = |v: &&Vec3| v.length() < 0.8;
     assert!(surface.mesh.vertices.iter().filter(in_hole).count() > 10);
-    let dropped = trim_by_distance(&mut surface.mesh, &cloud.positions, 0.2);
+    let dropped = trim_by_distance(&mut surface.mesh, &cloud.positions, 0.2, |_| 0.0);
     assert!(dropped > 0);
     assert_eq!(surface.mesh.vertices.iter().filter(in_hole).count(), 0);
     assert!(surface.mesh.vertices.iter().all(|v| v.z.abs() < 0.01));
@@ -163,6 +163,44 @@ fn invalid_points_are_ignored_and_counted() {
     let (clean, dirty) = (reconstructed(&clean, 6), reconstructed(&dirty, 6));
     assert_eq!(dirty.dropped_points, 4);
     assert_eq!(dirty.mesh, clean.mesh);
+}
+
+#[test]
+fn finest_cells_have_their_edge_whatever_the_extent() {
+    for (radius_m, depth) in [(0.4, 5), (1.0, 6), (3.0, 7)] {
+        let config = PoissonConfig {
+            cell_m: 0.06,
+            ..PoissonConfig::default()
+        };
+        let cloud = sphere(radius_m, 50_000);
+        let surface = reconstruct(&cloud, &config, MemoryBudget::default()).unwrap();
+        assert_relative_eq!(surface.cell_m, 0.06, epsilon = 1e-6);
+        // As the cube of the next power of two.
+        let side_m = 0.06 * f32::from(1_u16 << depth);
+        assert!((1.1 * 2.0 * radius_m..2.2 * 2.0 * radius_m + 0.01).contains(&side_m));
+        assert!(Topology::of(&surface.mesh).is_closed_manifold());
+    }
+}
+
+#[test]
+fn cells_are_at_least_half_of_the_resolution_at_their_place_and_meet_without_cracks() {
+    let cloud = sphere(3.0, 200_000);
+    let config = at_depth(7);
+    // Twice to four times the cells of 5.2 cm on the one side, those on the other.
+    let resolution_m = |position: Vec3| if position.x > 0.0 { 0.21 } else { 0.0 };
+    let budget = MemoryBudget::default();
+    let surface = reconstruct_resolved(&cloud, &config, resolution_m, budget).unwrap();
+    let topology = Topology::of(&surface.mesh);
+    assert!(topology.is_closed_manifold(), "{topology:?}");
+    assert_eq!(topology.euler, 2);
+    let vertices = &surface.mesh.vertices;
+    let count = |is_there: fn(&Vec3) -> bool| vertices.iter().filter(|v| is_there(v)).count();
+    let (fine, coarse) = (count(|v| v.x < -0.3), count(|v| v.x > 0.3));
+    // A quarter as many per doubling.
+    assert!((10..20).contains(&(fine / coarse)), "{fine} {coarse}");
+    for vertex in vertices {
+        assert_relative_eq!(vertex.length(), 3.0, epsilon = 0.02);
+    }
 }
 
 #[test]

@@ -126,4 +126,19 @@ mod tests {
         assert_eq!(trim_by_distance(&mut mesh, &[], 0.5, |_| 0.0), 8);
         assert!(mesh.vertices.is_empty());
     }
+
+    #[test]
+    fn the_largest_distance_is_that_of_the_place() {
+        let mut mesh = strip(40);
+        // One sample per five metres.
+        let samples: Vec<Vec3> = (0..9)
+            .map(|i| Vec3::new(5.0 * i as f32, 0.5, 0.0))
+            .collect();
+        let largest_m = |place: Vec3| if place.x < 20.0 { 0.0 } else { 2.1 };
+        trim_by_distance(&mut mesh, &samples, 0.51, largest_m);
+        // Triangles are a metre long, so that single vertices near a sample keep none.
+        let kept: Vec<f32> = mesh.vertices.iter().map(|vertex| vertex.x).collect();
+        assert!(kept.iter().all(|&x| x >= 20.0), "{kept:?}");
+        assert_eq!(kept.len(), 40);
+    }
 }

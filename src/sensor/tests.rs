@@ -305,6 +305,32 @@ fn what_a_sensor_is_is_known_of_it_and_rows_that_are_not_given_are_inferred() {
 }
 
 #[test]
+fn ranges_reach_as_far_as_nearly_all_returns_and_twice_as_far_in_a_building() {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    for (returned_m, reach_m) in [
+        (3.0, 10.0),
+        (8.0, 16.0),
+        (40.0, 50.0),
+        (70.0, 70.0),
+        (300.0, 120.0),
+    ] {
+        let point = |_| {
+            let [x, y, z] = std::array::from_fn(|_| rng.random_range(-1.0..1.0_f32));
+            returned_m * Vec3::new(x, y, z).normalize_or(Vec3::X)
+        };
+        let scan = Scan {
+            points: (0..5000).map(point).collect(),
+            ..Scan::default()
+        };
+        let found_m = infer(&[scan]).range_image.max_range;
+        assert!(
+            (found_m - reach_m).abs() < 0.01,
+            "{returned_m} m: {found_m} m"
+        );
+    }
+}
+
+#[test]
 fn nothing_follows_from_no_points_and_damaged_ones() {
     let infer = |scans: &[Scan]| Sensor::infer(scans, &SensorConfig::default());
     let scan = |point: Option<Vec3>| Scan {
