@@ -61,6 +61,17 @@ pub struct PoissonConfig {
 impl PoissonConfig {
     /// Allowed depths.
     pub(crate) const DEPTHS: RangeInclusive<u32> = 3..=12;
+
+    /// Depth of the finest cells, and edge of the cube around points with a bounding box of an edge [m].
+    fn cube(&self, extent_m: f32) -> (u32, f32) {
+        let least_m = self.scale * extent_m;
+        if let Some(depth) = self.depth {
+            return (depth, least_m);
+        }
+        let depth = (least_m / self.cell_m).log2().ceil().max(0.0) as u32;
+        let depth = depth.clamp(*Self::DEPTHS.start(), *Self::DEPTHS.end());
+        (depth, least_m.max(self.cell_m * (1_u32 << depth) as f32))
+    }
 }
 
 impl Validate for PoissonConfig {
@@ -124,7 +135,7 @@ pub fn reconstruct_resolved(
     memory_budget: MemoryBudget,
 ) -> Result<Reconstruction, MeshingError> {
     config.validate()?;
-    let samples = Samples::new(cloud, config)?;
+    let samples = Samples::new(cloud, |extent_m| config.cube(extent_m))?;
     let cell_m = samples.cell_m();
     if cell_m > MAX_CELL_M {
         return Err(MeshingError::CellsTooLarge {

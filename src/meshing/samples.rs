@@ -4,7 +4,6 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::error::MeshingError;
-use super::poisson::PoissonConfig;
 use crate::geometry::morton;
 use crate::geometry::{Aabb, PointCloud};
 
@@ -30,9 +29,9 @@ impl Samples {
     /// Minimum number of usable points.
     const MIN_POINTS: usize = 4;
 
-    /// The usable points of a cloud; the edge of the cube is at least `scale` times the longest edge of their
-    /// bounding box.
-    pub fn new(cloud: &PointCloud, config: &PoissonConfig) -> Result<Self, MeshingError> {
+    /// The usable points of a cloud; `cube` returns the depth of the cells and the edge of the cube [m] for the longest edge
+    /// of the points' bounding box [m].
+    pub fn new(cloud: &PointCloud, cube: impl Fn(f32) -> (u32, f32)) -> Result<Self, MeshingError> {
         let usable: Vec<u32> = (0..cloud.len())
             .filter(|&index| is_usable(cloud, index))
             .map(|index| index as u32)
@@ -47,16 +46,7 @@ impl Samples {
                 needed: Self::MIN_POINTS,
             });
         }
-        let least_m = config.scale * extent_m;
-        let (depth, side_m) = config.depth.map_or_else(
-            || {
-                let depth = (least_m / config.cell_m).log2().ceil();
-                let depth = (depth.max(0.0) as u32)
-                    .clamp(*PoissonConfig::DEPTHS.start(), *PoissonConfig::DEPTHS.end());
-                (depth, least_m.max(config.cell_m * (1_u32 << depth) as f32))
-            },
-            |depth| (depth, least_m),
-        );
+        let (depth, side_m) = cube(extent_m);
         let origin = bounds.center() - Vec3::splat(0.5 * side_m);
         let unit = |index: u32| (at(index) - origin) / side_m;
         let cells = (1_u32 << depth) as f32;
