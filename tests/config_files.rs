@@ -174,6 +174,10 @@ fn the_build_map_file_of_range_mcl_loads_unchanged() {
         ..BuildMapConfig::default()
     };
     expected.map.sensor.range_image = known().range_image;
+    let local_map = &mut expected.map.local_map;
+    local_map.poisson.depth = Some(9);
+    (local_map.crop_x_m, local_map.crop_y_m, local_map.crop_z_m) =
+        (Some(30.0), Some(30.0), Some(5.0));
     assert_eq!(config, expected);
 }
 
