@@ -1,4 +1,4 @@
-//! The ground confidence of points determines the colors of the map and its simplification.
+//! The ground confidence of points determines the colors of the map.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -6,7 +6,7 @@ use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::ground::GroundClassifier;
 use fpmcl::lidar::LidarModel;
 use fpmcl::lidar::Scan;
-use fpmcl::map::{LocalMapCounts, MapBuilder, MapConfig};
+use fpmcl::map::{MapBuilder, MapConfig};
 use fpmcl::sensor::Sensor;
 use fpmcl::simulation::{ScannerConfig, kerb_scene};
 
@@ -25,7 +25,7 @@ impl GroundClassifier for ByScan {
 }
 
 /// Map of a scan and of the same scan without every fourth point.
-fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMapCounts) {
+fn map(small: f32, large: f32, ground_threshold: f32) -> TriangleMesh {
     let scanner = ScannerConfig {
         azimuth_steps: 600,
         ..ScannerConfig::default()
@@ -45,6 +45,7 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
     config.local_map.poisson.depth = Some(6);
     (config.local_map.crop_x_m, config.local_map.crop_y_m) = (Some(10.0), Some(10.0));
     config.local_map.visibility.enabled = false;
+    config.local_map.simplify_resolution_m = 0.0;
     let sensor = Sensor {
         range_image: LidarModel::default(),
         ..Sensor::hdl64e()
@@ -57,8 +58,9 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
         large_from,
     });
     let read = |key: usize| Ok(scans[key].clone());
-    let built = plan.build_local_map(&plan.local_maps[0], &read).unwrap();
-    (built.mesh, built.counts)
+    plan.build_local_map(&plan.local_maps[0], &read)
+        .unwrap()
+        .mesh
 }
 
 fn mean_red(mesh: &TriangleMesh) -> f32 {
@@ -69,10 +71,8 @@ fn mean_red(mesh: &TriangleMesh) -> f32 {
 #[test]
 fn more_confident_points_make_redder_vertices() {
     let means = [0.0, 0.4, 0.99].map(|confidence| {
-        // No confidence reaches this threshold, so nothing is simplified.
-        let (mesh, counts) = map(confidence, confidence, 1.0);
+        let mesh = map(confidence, confidence, 1.0);
         assert!(mesh.colors.len() > 300);
-        assert_eq!(counts.simplified_triangles, 0);
         mean_red(&mesh)
     });
     assert!(means[0] < 1.0, "{means:?}");
@@ -84,21 +84,22 @@ fn more_confident_points_make_redder_vertices() {
 
 #[test]
 fn different_confidences_are_averaged_in_the_color() {
-    let [low, high] = [0.5, 0.9].map(|confidence| mean_red(&map(confidence, confidence, 1.0).0));
-    let between = mean_red(&map(0.9, 0.5, 1.0).0);
+    let [low, high] = [0.5, 0.9].map(|confidence| mean_red(&map(confidence, confidence, 1.0)));
+    let between = mean_red(&map(0.9, 0.5, 1.0));
     let share = (between - low) / (high - low);
     assert!(share > 0.3 && share < 0.7, "{low} {between} {high}");
 }
 
 #[test]
-fn the_mean_confidence_of_the_scans_determines_what_is_simplified() {
-    let simplified = |small, large| map(small, large, 0.6).1.simplified_triangles;
-    let (agreed, none) = (simplified(0.9, 0.9), simplified(0.5, 0.5));
-    assert!(agreed > 100, "{agreed}");
-    assert_eq!(none, 0);
+fn the_mean_confidence_of_the_scans_determines_what_is_ground() {
+    // Share of the vertices that are red.
+    let ground = |small, large| {
+        let colors = map(small, large, 0.6).colors;
+        let red = colors.iter().filter(|[red, _, blue]| red > blue).count();
+        red as f32 / colors.len() as f32
+    };
+    assert_eq!((ground(0.9, 0.9), ground(0.5, 0.5)), (1.0, 0.0));
     // The mean of a confident and an uncertain scan, 0.7, exceeds the threshold nearly everywhere.
-    let mixed = simplified(0.9, 0.5);
-    assert!(2 * mixed > agreed, "{mixed} of {agreed}");
-    let few = simplified(0.6, 0.5);
-    assert!(10 * few < agreed, "{few} of {agreed}");
+    let (mixed, few) = (ground(0.9, 0.5), ground(0.6, 0.5));
+    assert!(mixed > 0.5 && few < 0.1, "{mixed} {few}");
 }

@@ -92,7 +92,7 @@ pub fn drive(
         args.remapped(clouds)
     );
     let mesh = run_output::map_around(&drive.opened.map, iter::empty())?;
-    publisher.map(&mesh.vertices, now_ns());
+    publisher.map(&mesh, now_ns());
     drop(mesh);
 
     let publisher = RefCell::new(publisher);

@@ -15,7 +15,7 @@ use super::node::{Node, Quality, Writer};
 use super::shared::{Place, Shared};
 use crate::app::report::export::LiveFrame;
 use crate::evaluation::trust::Axes;
-use crate::geometry::Pose3;
+use crate::geometry::{Pose3, TriangleMesh, sample_surface, surface_area_m2};
 use crate::lidar::Motion;
 use crate::live::{LiveState, Reason};
 use crate::localization::Estimate;
@@ -23,8 +23,9 @@ use crate::localization::Estimate;
 /// Time between two diagnostics of the same state.
 const DIAGNOSTICS: Duration = Duration::from_secs(1);
 
-/// Largest number of points of the map that is published.
-const MOST_POINTS: usize = 500_000;
+/// Largest number of points of the map that is published, and their smallest spacing [m].
+const MOST_POINTS: f64 = 500_000.0;
+const SPACING_M: f64 = 0.2;
 
 /// Messages that are kept for slow readers of reliable topics.
 const DEPTH: i32 = 10;
@@ -74,10 +75,10 @@ impl<'a> Publisher<'a> {
         })
     }
 
-    /// Publishes the points of the map, of large maps each n-th one.
-    pub fn map(&self, points: &[Vec3], stamp_ns: u64) {
-        let step = points.len().div_ceil(MOST_POINTS).max(1);
-        let points: Vec<Vec3> = points.iter().copied().step_by(step).collect();
+    /// Publishes points on the surface of the map.
+    pub fn map(&self, mesh: &TriangleMesh, stamp_ns: u64) {
+        let spacing_m = (surface_area_m2(mesh) / MOST_POINTS).sqrt().max(SPACING_M);
+        let points = sample_surface(mesh, spacing_m);
         self.map
             .send(cloud(&points, stamp_ns, &self.shared.map_frame));
     }
