@@ -39,10 +39,10 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PoissonConfig {
-    /// Edge of the finest cells where `depth` is not given, 0.01 to 1.5 [m].
+    /// Edge of the finest cells, 0.01 to 1.5 [m]; without effect where `depth` is given.
     #[default(0.1)]
     pub cell_m: f32,
-    /// Depth of the finest cells, the number of bisections of the cube, 3 to 12; null: as many as lead to `cell_m`.
+    /// Depth of the finest cells, the number of bisections of the cube, 3 to 12; null: that of `cell_m`.
     pub depth: Option<u32>,
     /// Edge of the cube over the longest edge of the points' bounding box, 1.05 to 10 (unitless).
     #[default(1.1)]
@@ -62,7 +62,7 @@ impl PoissonConfig {
     /// Allowed depths.
     pub(crate) const DEPTHS: RangeInclusive<u32> = 3..=12;
 
-    /// Depth of the finest cells, and edge of the cube around points with a bounding box of an edge [m].
+    /// Depth of the finest cells and edge of the cube [m], for the longest edge of the points' bounding box [m].
     fn cube(&self, extent_m: f32) -> (u32, f32) {
         let least_m = self.scale * extent_m;
         if let Some(depth) = self.depth {

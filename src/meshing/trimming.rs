@@ -15,8 +15,8 @@ pub fn trim_by_density(mesh: &mut TriangleMesh, densities: &[f32], quantile: f64
     mesh.retain_triangles(|_, triangle| triangle.iter().all(|&v| densities[v as usize] >= limit))
 }
 
-/// Removes the triangles with a vertex farther than the largest distance at its position [m] from every sample; returns
-/// their number. No distance is less than `least_m`.
+/// Removes the triangles with a vertex that is farther from every sample than `largest_m` at its position, or than `least_m`
+/// where that is more [m]; returns their number.
 pub fn trim_by_distance(
     mesh: &mut TriangleMesh,
     samples: &[Vec3],

@@ -6,7 +6,7 @@ use super::stencil::{interpolate, trilinear};
 pub struct SampleWeights<'a> {
     /// Depth at which a cell face holds `samples_per_node` samples, per sample.
     pub depths: &'a [f32],
-    /// Depth of the finest cells at each sample, at most as above.
+    /// Depth of the finest cells at each sample, which is at most its sampling depth.
     pub finest: &'a [f32],
     /// Number of samples per cell face at a sample's depth.
     pub samples_per_node: f32,

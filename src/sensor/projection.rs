@@ -129,11 +129,11 @@ fn rowless(scans: &[Scan]) -> LidarModel {
 
 /// Least and greatest range of a return [m].
 ///
-/// The greatest is that of nearly all returns, but at least 50 m, or twice it in a building, whose next room may be larger. The
-/// least is that of nearly all returns apart from the own car, but between 0.3 m, where housings and hands are, and 2 m.
+/// The greatest is that of nearly all returns, between 50 and 120 m. In a building, where it would be less than 50 m, it is twice
+/// that of nearly all returns, because the next room may be larger. The least is that of nearly all returns apart from the own car, but between 0.3 m, where housings and hands are, and 2 m.
 fn range_limits(scans: &[Scan], [x_min, x_max, y_min, y_max]: [f32; 4]) -> (f32, f32) {
     const NEARLY_ALL: f64 = 0.99;
-    /// Beyond it, points of a scan are farther apart than surfaces are large [m].
+    /// Range of the HDL-64E and the OS1-64 by their data sheets [m].
     const FARTHEST_M: f32 = 120.0;
     let is_own = |x: f32, y: f32| x > x_min && x < x_max && y > y_min && y < y_max;
     let mut ranges: Vec<f32> = (scans.iter().flat_map(|scan| &scan.points))

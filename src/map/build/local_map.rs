@@ -23,9 +23,9 @@ use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, requ
 /// cells apart along an axis.
 const CELLS_PER_EDGE: f32 = 2.0;
 
-/// Least angle under which a cell is seen from the path [rad]: 0.9 degrees. With half of it a map has a third more triangles
-/// and the same errors, with one and a half times it the errors begin to grow; docs/method.md has the table.
-const CELL_RAD: f32 = 1.0 / 64.0;
+/// Size of the cells far from the path, relative to the distance from it (unitless). With half of it a map has up to twice as
+/// many triangles and the same errors, with one and a half times it errors begin to grow; docs/method.md has the table.
+const CELL_PER_DISTANCE: f32 = 1.0 / 64.0;
 
 /// Processing of scans into a mesh.
 ///
@@ -113,7 +113,9 @@ impl Validate for LocalMapConfig {
             ("crop_z_m", self.crop_z_m),
         ];
         for (key, extent_m) in crop {
-            in_range(key, extent_m.unwrap_or(MAX_CROP_M), 0.001..=MAX_CROP_M)?;
+            if let Some(extent_m) = extent_m {
+                in_range(key, extent_m, 0.001..=MAX_CROP_M)?;
+            }
         }
         nested("poisson", &self.poisson)?;
         require(
@@ -279,7 +281,8 @@ pub(crate) fn build_of_cloud<E: From<MeshingError>>(
     Ok(finish(mesh, cloud, domain, config, counts))
 }
 
-/// The size of the cells by their distance from the nearest scan [m]; all are of the finest where a depth is given.
+/// Returns the size of the cells at a position [m], by its horizontal distance from the nearest scan; 0, that of the finest
+/// cells, where a depth is given.
 fn resolution_around(
     scans: &[ScanCloud],
     config: &LocalMapConfig,
@@ -296,7 +299,7 @@ fn resolution_around(
         }
         nearest
             .first()
-            .map_or(0.0, |(squared, _)| CELL_RAD * squared.sqrt())
+            .map_or(0.0, |(squared, _)| CELL_PER_DISTANCE * squared.sqrt())
     }
 }
 
@@ -318,7 +321,7 @@ fn surface(
         return Ok(None);
     };
     counts.reconstructed_triangles = mesh.triangles.len();
-    // Sparse is what is sparser than its cells.
+    // Densities relative to the cells at each vertex.
     (densities.par_iter_mut().zip(&mesh.vertices))
         .for_each(|(depth, &vertex)| *depth += (resolution_m(vertex) / cell_m).max(1.0).log2());
     counts.sparse_triangles = meshing::trim_by_density(&mut mesh, &densities, config.min_density);
@@ -401,8 +404,8 @@ fn reconstruct(
     }
 }
 
-/// Simplifies the ground and the rest, apart from vertices on the border of the region and between both, and colours the mesh by
-/// ground confidence.
+/// Simplifies the ground and the rest, and colours the mesh by ground confidence. Held vertices, and those between ground and
+/// rest, stay.
 fn simplify_and_colour(
     mesh: &mut TriangleMesh,
     cloud: &PointCloud,

@@ -54,14 +54,8 @@ pub fn prepared_map(opened: &Opened) -> Result<Option<Map>> {
 pub fn residuals(opened: &Opened, map: Option<&Map>) -> Result<ResidualSums> {
     /// Scans that are compared with the same part of the map.
     const SCANS: usize = 8;
-    let (sensor, crop_m) = (
-        &opened.sensor,
-        opened
-            .config
-            .map
-            .local_map
-            .crop_m(&opened.sensor.range_image),
-    );
+    let sensor = &opened.sensor;
+    let crop_m = (opened.config.map.local_map).crop_m(&sensor.range_image);
     let mut sums = ResidualSums::default();
     let Some(map) = map else {
         return Ok(sums);
@@ -90,9 +84,7 @@ pub fn agreement(opened: &Opened, path: &MappingPath) -> Result<Option<TruthAgre
         return Ok(None);
     };
     let (mesh, surface) = (ply::read(&config.mesh_file)?, ply::read(truth)?);
-    let (path, crop_m) = (
-        &path.map_from_lidar,
-        config.map.local_map.crop_m(&sensor.range_image),
-    );
+    let crop_m = config.map.local_map.crop_m(&sensor.range_image);
+    let path = &path.map_from_lidar;
     Ok(TruthAgreement::new(&mesh, &surface, path, sensor, crop_m))
 }

@@ -270,8 +270,8 @@ impl<'a, 'b> Driver<'a, 'b> {
         measured?.since(last, time_s - last_s)
     }
 
-    /// A time between arrivals as it was when it was recorded, so that a slow replay is no stalled sensor. Of a fast one it is
-    /// the time that passes: the files may be what is slow.
+    /// The time of the recording for a time that passes between two scans, so that a slow replay does not look like a stalled
+    /// sensor. In a fast replay, where reading the files may take longer, the time that passes.
     fn recorded_time(&self, passed: Duration) -> Duration {
         passed.mul_f64(self.drive.rate.min(1.0))
     }
