@@ -15,8 +15,10 @@ use std::thread;
 use std::time::Duration;
 
 use signal_hook::consts::signal::{
-    SIGALRM, SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1, SIGUSR2, SIGXCPU,
+    SIGALRM, SIGHUP, SIGINT, SIGPROF, SIGQUIT, SIGTERM, SIGUSR1, SIGUSR2, SIGVTALRM, SIGXCPU,
+    SIGXFSZ,
 };
+use signal_hook::flag;
 use signal_hook::iterator::Signals;
 
 use crate::files;
@@ -24,13 +26,16 @@ use crate::map::BuildError;
 use crate::mapping::MappingError;
 
 /// The signals that end a process by default, can be handled, and do not report a fault of the program: those of
-/// terminals, service managers, batch systems (`USR1`, `USR2`) and limits of time (`XCPU`, `ALRM`).
-const SIGNALS: [i32; 8] = [
-    SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGUSR1, SIGUSR2, SIGALRM, SIGXCPU,
+/// terminals, service managers, batch systems (`USR1`, `USR2`) and limits of time (`XCPU`, and those of timers).
+const SIGNALS: [i32; 10] = [
+    SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGUSR1, SIGUSR2, SIGALRM, SIGXCPU, SIGVTALRM, SIGPROF,
 ];
 
 /// Time from the request to stop until the process ends.
 const GRACE: Duration = Duration::from_millis(1500);
+
+/// Longest time that the last message takes: a terminal may be stopped, or a pipe full.
+const LAST_WORDS: Duration = Duration::from_millis(200);
 
 /// Time between two looks at the request.
 const POLL: Duration = Duration::from_millis(20);
@@ -71,6 +76,8 @@ impl Interrupt {
         let handled = interrupt.clone();
         let ignored = ignored_signals();
         let is_ignored = |signal: i32| ignored >> (signal - 1) & 1 == 1;
+        // A file beyond the limit of the shell is an error of its writer then, as on a full disk.
+        flag::register(SIGXFSZ, Arc::default())?;
         let mut signals = Signals::new(SIGNALS.into_iter().filter(|it| !is_ignored(*it)))?;
         thread::spawn(move || signals.forever().for_each(|_signal| handled.signalled()));
         Ok(interrupt)
@@ -82,9 +89,14 @@ impl Interrupt {
             files::abandon_writes();
             exit();
         }
-        tracing::warn!("interrupted: keeping what is finished; press Ctrl-C again to stop at once");
         let watched = self.clone();
         thread::spawn(move || watched.exit_when_overdue());
+        // Nobody may read what is written: neither the next signal nor the end of the process waits for it.
+        thread::spawn(|| {
+            tracing::warn!(
+                "interrupted: keeping what is finished; press Ctrl-C again to stop at once"
+            );
+        });
     }
 
     /// Whether a signal has requested to stop.
@@ -194,7 +206,13 @@ impl Interrupt {
     fn exit_after_saving(&self) -> ! {
         let _saving = self.saving();
         files::abandon_writes();
-        tracing::error!("{}", self.error());
+        let (written, last_words) = channel::<()>();
+        let error = self.error();
+        thread::spawn(move || {
+            tracing::error!("{error}");
+            drop(written);
+        });
+        let _ = last_words.recv_timeout(LAST_WORDS);
         exit()
     }
 }
