@@ -401,7 +401,7 @@ fn a_busy_localization_ends_in_time_and_keeps_its_finished_frames() {
     recording.fpmcl("build-map").succeeds();
     let scan = PipedScan::new(&recording, 7);
     // Those of terminals, of service managers and batch systems, and of limits of time.
-    for signal in ["-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-ALRM", "-XCPU"] {
+    for signal in ["-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-PROF", "-XCPU"] {
         let forced = [LOCALIZE, &["--force"]].concat();
         let stderr = overdue(signal, &recording, &forced, &scan);
         let kept = "interrupted; 7 of 12 frames are localized and kept in results/";
@@ -423,7 +423,7 @@ fn a_drive_that_is_interrupted_keeps_its_frames_also_while_no_scan_arrives() {
         &["--replay=velodyne", "--rate=1000", "--queue=100"],
     ]
     .concat();
-    for signal in ["-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-ALRM", "-XCPU"] {
+    for signal in ["-INT", "-TERM"] {
         let opened = scan.opened();
         let mut child = start(&recording, &live);
         let _pipe = wait(&opened, &mut child);
@@ -439,6 +439,74 @@ fn a_drive_that_is_interrupted_keeps_its_frames_also_while_no_scan_arrives() {
         assert!(stderr.contains(&kept), "{stderr}");
         assert_eq!(temporary_files(&recording, "results"), [""; 0]);
     }
+}
+
+#[test]
+fn a_signal_ends_a_command_whose_messages_nobody_reads() {
+    let recording = Recording::street(6);
+    recording.fpmcl("build-map").succeeds();
+    let scan = PipedScan::new(&recording, 3);
+    let opened = scan.opened();
+    let mut shell = Command::new("sh");
+    // As many bytes as fit into the pipe.
+    let full = "head -c 65536 /dev/zero >&2; exec \"$0\" \"$@\"";
+    shell
+        .args(["-c", full])
+        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
+    let mut child = start_by(shell, &recording, &[LOCALIZE, &["--quiet"]].concat());
+    let _pipe = wait(&opened, &mut child);
+    stopped_in_time("-TERM", child);
+    let results = LocalizationResults::read(&recording.path("results/localization.npz"));
+    assert_eq!(results.unwrap().frames.len(), 3);
+}
+
+#[test]
+fn a_file_beyond_the_limit_of_the_shell_is_an_error_of_one_line() {
+    let recording = Recording::street(6);
+    recording.fpmcl("build-map").succeeds();
+    let mut shell = Command::new("sh");
+    shell
+        .args(["-c", "ulimit -f 8; exec \"$0\" \"$@\""])
+        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
+    let mut child = start_by(shell, &recording, LOCALIZE);
+    let stderr = read_until(&mut stderr_of(&mut child), None);
+    assert_eq!(child.wait().unwrap().code(), Some(1), "{stderr}");
+    assert!(stderr.contains("File too large"), "{stderr}");
+    assert_eq!(stderr.matches("error: ").count(), 1, "{stderr}");
+    assert_eq!(temporary_files(&recording, "results"), [""; 0]);
+}
+
+#[test]
+fn a_link_that_replaces_the_folder_of_a_simulation_is_not_followed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let mut child = Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"))
+        .args(["simulate", "--set=output_folder=out", "--set=n_scans=300"])
+        .current_dir(folder.path())
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    while !path("out/drive_1/velodyne/000000.bin").exists() {
+        assert!(child.try_wait().unwrap().is_none(), "it has ended");
+        thread::sleep(Duration::from_millis(5));
+    }
+    send("-STOP", &child);
+    fs::create_dir_all(path("others/drive_1/velodyne")).unwrap();
+    fs::create_dir_all(path("others/drive_1/labels")).unwrap();
+    fs::write(path("others/drive_1/poses.txt"), "theirs").unwrap();
+    fs::rename(path("out"), path("moved")).unwrap();
+    std::os::unix::fs::symlink("others", path("out")).unwrap();
+    send("-CONT", &child);
+    let stderr = read_until(&mut stderr_of(&mut child), None);
+    assert_eq!(child.wait().unwrap().code(), Some(1), "{stderr}");
+    assert!(stderr.contains("was replaced"), "{stderr}");
+    assert_eq!(
+        fs::read(path("others/drive_1/poses.txt")).unwrap(),
+        b"theirs"
+    );
+    let scans = fs::read_dir(path("others/drive_1/velodyne")).unwrap();
+    assert_eq!(scans.count(), 0);
 }
 
 #[test]

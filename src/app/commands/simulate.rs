@@ -24,7 +24,7 @@ use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::memory;
 use crate::app::run::{Claims, Context, Interrupt, Printed, Task, output, version};
 use crate::app::settings::to_yaml;
-use crate::files::remove_abandoned;
+use crate::files::{claim_folder, remove_abandoned};
 use crate::geometry::{Pose3, distances_m};
 use crate::map::files::ply;
 use crate::recording::Calibration;
@@ -106,6 +106,7 @@ fn write_drive(
         simulation.frames()
     } else {
         output::create_folder(&folder)?;
+        claim_folder(&folder)?;
         remove_abandoned(&folder)?;
         claims.begin_with_key(&main, &key)?;
         write_constants(config, &simulation)?;

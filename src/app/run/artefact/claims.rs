@@ -13,6 +13,7 @@
 //! Lines are only appended, so that processes may write to one folder at the same time. A line that a full disk cut, with
 //! no end, counts for nothing.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read as _, Seek as _, SeekFrom, Write as _};
@@ -246,6 +247,12 @@ impl Claims {
             return Ok(());
         }
         let path = self.folder.join(CLAIMS_FILE);
+        let is_link = fs::symlink_metadata(&path).is_ok_and(|found| found.is_symlink());
+        ensure!(
+            !is_link,
+            "{} is a link, and is not followed; remove it",
+            path.display()
+        );
         check_claimed(&path)
             .and_then(|()| append(&path, &lines))
             .with_context(|| format!("cannot write {}", path.display()))
@@ -263,6 +270,10 @@ fn append(path: &Path, lines: &str) -> io::Result<()> {
     file.write_all(format!("{cut}{lines}").as_bytes())
 }
 
-fn name_of(path: &Path) -> std::borrow::Cow<'_, str> {
-    path.file_name().unwrap_or_default().to_string_lossy()
+/// The name of an output as in the claims: in one line.
+fn name_of(path: &Path) -> Cow<'_, str> {
+    match path.file_name().unwrap_or_default().to_string_lossy() {
+        name if name.contains('\n') => name.replace('\n', "\\n").into(),
+        name => name,
+    }
 }

@@ -3,7 +3,7 @@
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 
 /// A locked file.
 pub struct Lock {
@@ -43,9 +43,23 @@ impl Lock {
     }
 
     fn open(path: &Path) -> Result<Self> {
-        let file = File::create(path).with_context(|| cannot_lock(path))?;
+        let is_ours = || match fs::symlink_metadata(path) {
+            Ok(found) => found.is_file() && found.len() == 0,
+            Err(_missing) => true,
+        };
+        let own = || -> Result<File> {
+            ensure!(is_ours(), "it is no lock of fpmcl; move it");
+            let mut options = File::options();
+            let file = options
+                .write(true)
+                .create(true)
+                .truncate(false)
+                .open(path)?;
+            ensure!(is_ours(), "it was replaced while it was opened");
+            Ok(file)
+        };
         Ok(Self {
-            file,
+            file: own().with_context(|| cannot_lock(path))?,
             path: path.to_owned(),
         })
     }
@@ -66,7 +80,8 @@ fn is_at(file: &File, path: &Path) -> bool {
     {
         use std::os::unix::fs::MetadataExt as _;
         let place = |metadata: fs::Metadata| (metadata.dev(), metadata.ino());
-        let (of_file, of_path) = (file.metadata().map(place), fs::metadata(path).map(place));
+        let of_file = file.metadata().map(place);
+        let of_path = fs::symlink_metadata(path).map(place);
         matches!((of_file, of_path), (Ok(a), Ok(b)) if a == b)
     }
     #[cfg(not(unix))]
@@ -92,5 +107,22 @@ mod tests {
         let [first, second] = [true, true].map(|is_shared| Lock::now(&path, is_shared).unwrap());
         assert!(first.is_some() && second.is_some());
         drop(copy);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_file_of_the_user_is_no_lock_and_a_link_is_not_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let [own, link] = ["own", "lock"].map(|name| folder.path().join(name));
+        fs::write(&own, "precious").unwrap();
+        std::os::unix::fs::symlink(&own, &link).unwrap();
+        for path in [&own, &link] {
+            assert!(Lock::now(path, false).is_err() && Lock::wait(path).is_err());
+        }
+        assert_eq!(fs::read(&own).unwrap(), b"precious");
+        let missing = folder.path().join("missing");
+        fs::remove_file(&link).unwrap();
+        std::os::unix::fs::symlink(&missing, &link).unwrap();
+        assert!(Lock::now(&link, false).is_err() && !missing.exists());
     }
 }
