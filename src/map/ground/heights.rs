@@ -31,8 +31,11 @@ const LARGE_EDGE_M: f64 = 500.0;
 /// surface of a road.
 const NARROW: f64 = 0.01;
 
-/// Largest number of chunks that a map in memory keeps, of about 16 kB each.
-const KEPT_CHUNKS: usize = 4096;
+/// Largest size of the chunks that a map in memory keeps, of about 16 kB per level each [bytes].
+const KEPT_BYTES: usize = 1 << 26;
+
+/// Largest number of levels of a cell, of which further ones are left out: those of a car park are fewer.
+const MOST_LEVELS: usize = 32;
 
 /// Smallest distance of two levels, less than the clearance that any vehicle needs [m].
 pub(crate) const LEVEL_GAP_M: f64 = 2.0;
@@ -82,7 +85,14 @@ pub(crate) struct GroundTriangles {
     /// Triangles by the squares of `2^level` chunks along the edge that they reach; the level of a triangle is the
     /// lowest at which it reaches at most two by two.
     squares: BTreeMap<u32, HashMap<Cell, Vec<u32>>>,
-    made: RwLock<HashMap<Cell, Option<SharedBytes>>>,
+    made: RwLock<MadeChunks>,
+}
+
+/// Chunks that were made, and their size [bytes].
+#[derive(Debug, Default)]
+struct MadeChunks {
+    chunks: HashMap<Cell, Option<SharedBytes>>,
+    bytes: usize,
 }
 
 impl GroundTriangles {
@@ -129,17 +139,20 @@ impl GroundTriangles {
 
 impl ChunkSource for GroundTriangles {
     fn chunk(&self, chunk: Cell) -> Result<Option<SharedBytes>, TileError> {
+        /// Size of the place of a chunk without ground [bytes].
+        const PLACE_BYTES: usize = 64;
         let made = self.made.read().unwrap_or_else(PoisonError::into_inner);
-        if let Some(made) = made.get(&chunk) {
+        if let Some(made) = made.chunks.get(&chunk) {
             return Ok(made.clone());
         }
         drop(made);
         let made = self.make(chunk);
         let mut all = self.made.write().unwrap_or_else(PoisonError::into_inner);
-        if all.len() >= KEPT_CHUNKS {
-            all.clear();
+        if all.bytes >= KEPT_BYTES {
+            *all = MadeChunks::default();
         }
-        all.insert(chunk, made.clone());
+        all.bytes += PLACE_BYTES + made.as_deref().map_or(0, <[u8]>::len);
+        all.chunks.insert(chunk, made.clone());
         Ok(made)
     }
 }
@@ -251,8 +264,10 @@ impl HeightSamples {
             }
             !is_near
         });
-        let index = clusters.partition_point(|cluster| cluster.high_m < added.low_m);
-        clusters.insert(index, added);
+        if clusters.len() < MOST_LEVELS {
+            let index = clusters.partition_point(|cluster| cluster.high_m < added.low_m);
+            clusters.insert(index, added);
+        }
     }
 
     fn into_chunks(self) -> Chunks {
