@@ -183,20 +183,24 @@ fn commits_of_the_pages_are_in_the_history() {
         skipped("this is no git checkout with its history");
         return;
     }
-    let is_commit = |word: &&str| {
+    // Digits alone are one where they are called so.
+    let is_commit = |[before, word]: &[&str; 2]| {
         let has = |is: fn(&u8) -> bool| word.bytes().any(|byte| is(&byte));
+        let is_called_so = || ["commit", "at", "of"].contains(before) && word.len() == 7;
         (7..=40).contains(&word.len())
             && word
                 .bytes()
                 .all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
             && has(u8::is_ascii_digit)
-            && has(u8::is_ascii_lowercase)
+            && (has(u8::is_ascii_lowercase) || is_called_so())
     };
     let mut count = 0;
     let mut missing = Vec::new();
     for (name, text) in texts() {
         let words = text.split(|c: char| !c.is_ascii_alphanumeric());
-        for commit in words.filter(is_commit) {
+        let words: Vec<&str> = words.filter(|word| !word.is_empty()).collect();
+        let pairs = words.windows(2).map(|pair| [pair[0], pair[1]]);
+        for [_, commit] in pairs.filter(is_commit) {
             count += 1;
             if git(&["merge-base", "--is-ancestor", commit, "HEAD"]).is_none() {
                 missing.push(format!("{name}: {commit}"));
