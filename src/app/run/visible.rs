@@ -28,7 +28,7 @@ fn escaped(text: &str, is_own: impl Fn(char) -> bool) -> Cow<'_, str> {
 
 /// Whether a character separates lines or changes the direction of text.
 fn is_direction(c: char) -> bool {
-    matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+    matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
 #[cfg(test)]

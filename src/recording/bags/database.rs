@@ -34,15 +34,21 @@ pub struct Database {
 }
 
 impl Database {
-    /// Opens a database without writing next to it.
+    /// Opens a database without writing next to it, but for the index of a log that an interrupted recorder left.
     pub fn open(path: &Path) -> Result<Self, String> {
         let mut log = path.as_os_str().to_owned();
         log.push("-wal");
         // A database whose recorder was interrupted has messages in its log, which needs a lock.
         let is_immutable = u8::from(!Path::new(&log).exists());
         let absolute = std::path::absolute(path).map_err(|error| error.to_string())?;
-        let escaped = absolute.to_string_lossy().replace('%', "%25");
-        let escaped = escaped.replace('?', "%3f").replace('#', "%23");
+        let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/._-".contains(&byte);
+        let bytes = absolute.as_os_str().as_encoded_bytes().iter();
+        let escaped: String = bytes
+            .map(|&byte| match byte {
+                byte if is_plain(byte) => char::from(byte).to_string(),
+                byte => format!("%{byte:02x}"),
+            })
+            .collect();
         let name = format!("file:{escaped}?immutable={is_immutable}");
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY
             | OpenFlags::SQLITE_OPEN_URI
