@@ -76,7 +76,9 @@ pub const FRAME: &str = "frame";
 impl LineChart {
     /// Panels one above the other, without those that show nothing.
     pub fn new(title: &str, x_name: &str, panels: impl IntoIterator<Item = Panel>) -> Self {
-        let has_points = |panel: &Panel| panel.series.iter().any(|it| !it.points.is_empty());
+        let is_shown = |(x, y): &(f64, f64)| x.is_finite() && y.is_finite();
+        let has_points =
+            |panel: &Panel| panel.series.iter().any(|it| it.points.iter().any(is_shown));
         Self {
             title: title.to_owned(),
             x_name: x_name.to_owned(),

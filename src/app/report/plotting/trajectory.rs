@@ -160,9 +160,12 @@ pub fn error_chart(title: &str, x_name: &str, trajectories: &[NamedErrors]) -> L
     LineChart::new(title, x_name, panels)
 }
 
-/// A chart of trajectories, each with name, color and a pose per true pose, where it has any: position, height and heading
-/// error against the distance, dashed after rigid alignment, and relative errors against the length of segments.
-pub fn drift_chart(truth: &[Pose3], trajectories: &[(&str, Rgb, Option<&[Pose3]>)]) -> LineChart {
+/// A trajectory: name, color, a pose per true pose, where it has any, and whether each is trusted.
+pub type NamedPoses<'a> = (&'a str, Rgb, &'a [Pose3], &'a [bool]);
+
+/// A chart of trajectories: position and heading error against the distance, dashed after rigid alignment, and relative
+/// errors against the length of segments. Poses that are not trusted are gaps.
+pub fn drift_chart(truth: &[Pose3], trajectories: &[NamedPoses]) -> LineChart {
     let mut panels = [
         "position error [m]",
         "heading error [deg]",
@@ -173,9 +176,19 @@ pub fn drift_chart(truth: &[Pose3], trajectories: &[(&str, Rgb, Option<&[Pose3]>
         y_name: y_name.to_owned(),
         ..Panel::default()
     });
-    for &(name, color, estimates) in trajectories {
-        let estimates = estimates.unwrap_or_default();
-        let moved = rigid_alignment(estimates, truth).map(|it| aligned(&it, estimates));
+    for &(name, color, estimates, trusted) in trajectories {
+        let trusted_of = |poses: &[Pose3]| -> Vec<Pose3> {
+            let poses = poses
+                .iter()
+                .zip(trusted)
+                .filter(|(_, is_trusted)| **is_trusted);
+            poses.map(|(pose, _)| *pose).collect()
+        };
+        let (of_estimates, of_truth) = match estimates {
+            [] => (Vec::new(), Vec::new()),
+            estimates => (trusted_of(estimates), trusted_of(truth)),
+        };
+        let moved = rigid_alignment(&of_estimates, &of_truth).map(|it| aligned(&it, estimates));
         let label = format!("{name}, rigidly aligned");
         for (name, mark, poses) in [
             (name, Mark::Line, estimates),
@@ -185,14 +198,18 @@ pub fn drift_chart(truth: &[Pose3], trajectories: &[(&str, Rgb, Option<&[Pose3]>
             let values: [fn(&DriftPoint) -> f64; 2] =
                 [|it| it.position_m, |it| it.heading_rad.to_degrees()];
             for (panel, value) in panels.iter_mut().zip(values).filter(|_| !points.is_empty()) {
-                let points = points.iter().map(|it| (it.distance_m, value(it)));
+                let or_gap = |(it, is_trusted): (&DriftPoint, &bool)| {
+                    let value = if *is_trusted { value(it) } else { f64::NAN };
+                    (it.distance_m, value)
+                };
+                let points = points.iter().zip(trusted).map(or_gap);
                 panel.series.push(Series {
                     mark,
                     ..Series::line(name, color, points)
                 });
             }
         }
-        let by_length = SpatialMetrics::new(estimates, truth, 0).map(|it| it.by_length);
+        let by_length = SpatialMetrics::new(&of_estimates, &of_truth, 0).map(|it| it.by_length);
         let by_length = by_length.unwrap_or_default();
         let values: [fn(&LengthErrors) -> f64; 2] = [
             |it| it.errors.translation_percent,

@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result};
 use glam::DVec3;
 
 use super::{INTERACTIVE, RunFiles};
-use crate::app::report::plotting::color::{MCL, REFINED, Rgb, STATES};
+use crate::app::report::plotting::color::{MCL, REFINED, STATES};
 use crate::app::report::plotting::{
     FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark, Panel,
     PathPlot, RangeImageStrip, SURFACES, Series, drift_chart, error_chart, muted, save_animation,
@@ -131,19 +131,10 @@ impl<'a> Drawing<'a> {
         }
     }
 
-    /// Name, color and poses of what was found, the best last.
-    fn found(&self) -> Vec<(&'static str, Rgb, &[Pose2])> {
-        let refined = self.results.refined.as_deref();
-        let refined = refined.map(|poses| ("refined", REFINED, poses));
-        std::iter::once((self.name, MCL, self.estimates.as_slice()))
-            .chain(refined)
-            .collect()
-    }
-
-    /// Saves a chart in `plots/`, if it shows anything.
+    /// Saves a chart in `plots/`, or removes that of an earlier run if it shows nothing.
     fn save(&self, chart: &LineChart, name: &str) -> Result<()> {
         if chart.panels.is_empty() {
-            return Ok(());
+            return remove_if_exists(&self.files.file("plots").join(name));
         }
         chart.save(&self.files.plot(name)?)
     }
@@ -202,13 +193,19 @@ impl<'a> Drawing<'a> {
     }
 
     fn errors(&self) -> Result<()> {
-        let Some(truth) = self.truth.filter(|_| !self.results.particles.is_empty()) else {
-            return Ok(());
-        };
+        let truth = self.truth.filter(|_| !self.results.particles.is_empty());
         let (x_name, x) = time_axis(self.results);
-        let errors = self.found().into_iter().map(|(name, color, poses)| {
-            let errors = x.iter().copied().zip(planar_errors(poses, truth));
-            (name, color, errors.collect())
+        let refined = self.results.refined.as_deref();
+        let refined = refined.map(|poses| with_gaps(poses, &self.results.refined_trusted()));
+        let estimates = with_gaps(&self.estimates, &self.results.trusted());
+        let found = [
+            (self.name, MCL, estimates),
+            ("refined", REFINED, refined.unwrap_or_default()),
+        ];
+        let found = found.into_iter().filter(|(_, _, poses)| !poses.is_empty());
+        let errors = found.map(|(name, color, poses)| {
+            let errors = planar_errors(&poses, truth.unwrap_or_default());
+            (name, color, x.iter().copied().zip(errors).collect())
         });
         let errors: Vec<_> = errors.collect();
         self.save(
@@ -255,9 +252,19 @@ impl<'a> Drawing<'a> {
     /// Draws the errors in space against the distance driven.
     fn drift(&self) -> Result<()> {
         let truth = self.results.ground_truth_in_space.as_deref();
+        let (estimates, refined) = (
+            self.results.estimates_in_space.as_deref(),
+            self.results.refined_in_space.as_deref(),
+        );
+        let [of_filter, of_refined] = [self.results.trusted(), self.results.refined_trusted()];
         let trajectories = [
-            (self.name, MCL, self.results.estimates_in_space.as_deref()),
-            ("refined", REFINED, self.results.refined_in_space.as_deref()),
+            (
+                self.name,
+                MCL,
+                estimates.unwrap_or_default(),
+                of_filter.as_slice(),
+            ),
+            ("refined", REFINED, refined.unwrap_or_default(), &of_refined),
         ];
         let chart = drift_chart(truth.unwrap_or_default(), &trajectories);
         self.save(&chart, "drift.png")
