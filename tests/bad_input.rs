@@ -52,10 +52,10 @@ fn a_missing_input_is_reported_with_its_key_and_nothing_is_written() {
     recording
         .fpmcl("build-map")
         .set("scan_folder", "nowhere")
-        .fails_with(&["scan_folder is nowhere", "no such folder"]);
+        .fails_with(&["scan_folder (the recording) is nowhere", "no such folder"]);
     recording
         .fpmcl("localize")
-        .fails_with(&["map_file is map.ply", "no such file"]);
+        .fails_with(&["map_file (--map) is map.ply", "no such file"]);
     recording
         .fpmcl("refine")
         .fails_with(&["result_file is results/localization.npz", "no such file"]);
@@ -68,7 +68,7 @@ fn a_missing_odometry_is_reported_with_its_key() {
         .fpmcl("localize")
         .set("odometry_file", "wheels.txt")
         .set("odometry", "file")
-        .fails_with(&["odometry_file is wheels.txt", "no such file"]);
+        .fails_with(&["odometry_file (--odometry) is wheels.txt", "no such file"]);
 }
 
 #[test]

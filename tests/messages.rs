@@ -30,7 +30,7 @@ fn without_an_input_the_message_asks_for_one_and_names_no_path_as_given() {
     // The key that was set is the one that the message is about.
     fpmcl("build-map")
         .set("scan_folder", "nowhere")
-        .fails_with(&["scan_folder is nowhere", "no such folder"]);
+        .fails_with(&["scan_folder (the recording) is nowhere", "no such folder"]);
 }
 
 #[test]

@@ -4,6 +4,8 @@ use std::path::Path;
 
 use anyhow::{Result, ensure};
 
+use crate::app::settings::MapInputConfig;
+
 /// Requires the inputs of a command, each with its configuration key: files, the folder or bag of a recording, and poses,
 /// which may be a folder `oxts`.
 pub fn require(inputs: &[(&str, &Path)]) -> Result<()> {
@@ -29,16 +31,42 @@ pub fn is_bag(path: &Path) -> bool {
     };
 }
 
+/// A configuration key with the flag or argument that sets it.
+fn with_flag(key: &str) -> String {
+    let flag = match key {
+        "scan_folder" => "the recording",
+        "map_file" => "--map",
+        "pose_file" => "--poses, --truth",
+        "calib_file" => "--calib",
+        "odometry_file" => "--odometry",
+        "onto" => "--onto",
+        _ => return key.to_owned(),
+    };
+    format!("{key} ({flag})")
+}
+
 /// Requires a file at `path`, the value of the configuration key `key`.
 pub fn require_file(key: &str, path: &Path) -> Result<()> {
     ensure!(
         !path.is_dir(),
-        "{key} is {}, which is a folder; give the path of a file",
+        "{} is {}, which is a folder; give the path of a file",
+        with_flag(key),
         path.display()
     );
+    let is_default = key == "map_file" && path == MapInputConfig::default().map_file;
+    ensure!(
+        !is_default || path.exists(),
+        "no map was given, and {} does not exist; give one by --map MAP (map_file)",
+        path.display()
+    );
+    let or_topic = match key {
+        "pose_file" | "odometry_file" => ", or a topic of the bag, with its slash, such as /odom",
+        _ => "",
+    };
     ensure!(
         path.exists(),
-        "{key} is {}, but there is no such file; give the path of one",
+        "{} is {}, but there is no such file; give the path of one{or_topic}",
+        with_flag(key),
         path.display()
     );
     Ok(())
@@ -47,8 +75,15 @@ pub fn require_file(key: &str, path: &Path) -> Result<()> {
 /// Requires a folder at `path`, the value of the configuration key `key`.
 pub fn require_folder(key: &str, path: &Path) -> Result<()> {
     ensure!(
+        !path.is_file(),
+        "{} is {}, which is a file; give the path of a folder, or of a bag (.mcap, .db3, .bag)",
+        with_flag(key),
+        path.display()
+    );
+    ensure!(
         path.is_dir(),
-        "{key} is {}, but there is no such folder; give the path of one",
+        "{} is {}, but there is no such folder; give the path of one",
+        with_flag(key),
         path.display()
     );
     Ok(())

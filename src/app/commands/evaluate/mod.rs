@@ -149,7 +149,7 @@ fn of_trajectory(
 fn require_truth(results: &LocalizationResults, config: &EvaluationConfig) -> Result<()> {
     ensure!(
         results.ground_truth.is_some(),
-        "{} has no ground truth; set pose_file and calib_file to the poses of its recording",
+        "{} has no ground truth; give the true poses of its recording by --truth FILE, and their calibration by --calib FILE (pose_file, calib_file)",
         config.result_file.display()
     );
     Ok(())

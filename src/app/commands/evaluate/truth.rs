@@ -142,13 +142,6 @@ fn poses_by_number(
         track.path.display(),
         poses.len()
     );
-    if missing > 0 {
-        tracing::warn!(
-            "{} has no pose for the last {missing} of {} frames, which are left out",
-            track.path.display(),
-            results.len()
-        );
-    }
     let counts_differ = results.particles.is_empty() && last + 1 != poses.len();
     // Rows with times are of scans that were chosen by them, such as those that `localize` trusts.
     let chosen_by_time = results.estimates.is_none() && results.recorded_times().is_some();
@@ -160,6 +153,13 @@ fn poses_by_number(
         track.path.display(),
         poses.len()
     );
+    if missing > 0 {
+        tracing::warn!(
+            "{} has no pose for the last {missing} of {} frames, which are left out",
+            track.path.display(),
+            results.len()
+        );
+    }
     if counts_differ {
         tracing::warn!(
             "{} ends at row {last}, and the {} rows of {} are matched by number; give both times (TUM) if they do not begin at the same frame",
