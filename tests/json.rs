@@ -227,7 +227,11 @@ fn generated() -> String {
         for (name, definition) in entries(&root, "$defs") {
             let is_object = !entries(definition, "properties").is_empty();
             if is_object || words(definition).is_none() {
-                let section = format!("{}\n\n{}", docs(definition), table(&root, definition));
+                let content = match definition["type"].as_str() {
+                    Some("string") => "A text.\n".to_owned(),
+                    _ => table(&root, definition),
+                };
+                let section = format!("{}\n\n{content}", docs(definition));
                 types.insert(title(name).to_owned(), section);
             }
         }

@@ -63,7 +63,7 @@ pub struct TrajectoryReport {
     /// Errors as defined in the literature.
     pub metrics: TrajectoryMetrics,
     /// Errors in six degrees of freedom, where the poses in space are known.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub in_space: Option<SpatialMetrics>,
 }
 
@@ -95,10 +95,10 @@ pub struct Report {
     #[serde(default)]
     pub summary: RunSummary,
     /// Scans, latencies and states of a run of `live`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub live: Option<LiveSummary>,
     /// What the refinement did, if there was one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub refinement: Option<RefinementSummary>,
     /// Whether the true poses are known.
     #[serde(default)]
@@ -108,7 +108,7 @@ pub struct Report {
     /// Errors of the refined trajectory in the frames in which it is trusted, if there is one and they are any.
     pub refined: Option<TrajectoryReport>,
     /// Errors of a trajectory that is not a result in a map.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub trajectory: Option<SpatialMetrics>,
 }
 
@@ -194,7 +194,11 @@ impl Report {
 
     /// The same table in Markdown, with definitions.
     pub fn to_markdown(&self) -> String {
-        let mut text = self.about_lines("- ");
+        // Names from outside are no markup.
+        let mut text = self
+            .about_lines("- ")
+            .replace('&', "&amp;")
+            .replace('<', "&lt;");
         let [title, rule] = if self.is_refined() {
             [" refined |", "---:|"]
         } else {
