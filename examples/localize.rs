@@ -7,7 +7,7 @@
 
 use std::path::PathBuf;
 
-use fpmcl::localization::{Tracker, TrackerConfig};
+use fpmcl::localization::{State, Tracker, TrackerConfig};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::{Recording, write_tum};
 use fpmcl::sensor::{Sensor, SensorConfig};
@@ -30,7 +30,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             "{}: {:.2} {:.2} +- {:.3?} {state}",
             frame.number, t.x, t.y, deviations
         );
-        trajectory.push(frame.stamped(estimate.map_from_lidar));
+        // Only what is believed is a pose.
+        if estimate.state == State::Tracking {
+            trajectory.push(frame.stamped(estimate.map_from_lidar));
+        }
     }
     write_tum(std::fs::File::create(trajectory_file)?, &trajectory)?;
     Ok(())
