@@ -4,6 +4,7 @@
 //! software adapter (a graphics driver that runs on the CPU): the ray packets of the CPU renderer
 //! do the same work many times faster.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use super::backend::{AdapterReport, Backend, RenderingMethod, best_adapter};
@@ -77,13 +78,28 @@ impl BackendChoice {
 pub fn choose(backend: Backend, method: RenderingMethod) -> Result<BackendChoice, RenderError> {
     let adapters = match backend {
         Backend::Cpu => Vec::new(),
+        // Drivers take time, and print errors of their own where there is no display.
+        Backend::Auto if !may_have_graphics_card() => Vec::new(),
         Backend::Auto | Backend::Gpu => adapters(),
     };
     choose_among(adapters, backend, method)
 }
 
+/// Whether this machine may have a graphics card: on Linux, a card has a device file of one of these names.
+fn may_have_graphics_card() -> bool {
+    const DEVICES: [&str; 6] = [
+        "/dev/dri",
+        "/dev/nvidiactl",
+        "/dev/nvhost-gpu",
+        "/dev/dxg",
+        "/dev/mali0",
+        "/dev/kgsl-3d0",
+    ];
+    !cfg!(target_os = "linux") || DEVICES.iter().any(|path| Path::new(path).exists())
+}
+
 /// All graphics adapters of this machine, best first; none without the feature `gpu`.
-fn adapters() -> Vec<AdapterReport> {
+pub fn adapters() -> Vec<AdapterReport> {
     #[cfg(feature = "gpu")]
     return super::gpu::adapters();
     #[cfg(not(feature = "gpu"))]
@@ -119,7 +135,7 @@ fn choose_among(
 /// Why `auto` takes none of the adapters.
 fn reason_for_cpu(adapters: &[AdapterReport]) -> String {
     match adapters.first() {
-        None if cfg!(feature = "gpu") => "there is no graphics adapter".to_owned(),
+        None if cfg!(feature = "gpu") => "there is no graphics card".to_owned(),
         None => "fpmcl was built without the feature `gpu`".to_owned(),
         Some(AdapterReport {
             obstacle: Some(obstacle),

@@ -108,7 +108,7 @@ pub fn run(args: &DoctorArgs, context: &Context) -> Result<Printed> {
         has_graphics_support: cfg!(feature = "gpu"),
         backend_auto: choice.name(),
         backend_reason: choice.reason,
-        adapters: choice.adapters,
+        adapters: selection::adapters(),
         speeds: Vec::new(),
         weights: None,
     };
