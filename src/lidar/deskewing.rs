@@ -63,6 +63,14 @@ pub struct Rotation {
 }
 
 impl Rotation {
+    /// The same that starts at another azimuth, counter-clockwise from this one [rad].
+    pub(crate) fn turned(self, turn_rad: f64) -> Self {
+        Self {
+            start_rad: wrap_angle(self.start_rad + turn_rad),
+            ..self
+        }
+    }
+
     /// Time of each point from its azimuth, zero in the middle of the revolution [s].
     pub(crate) fn point_times(&self, points: &[Vec3]) -> Vec<f32> {
         let sense = self.direction.sense() as f32;

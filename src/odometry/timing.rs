@@ -14,7 +14,6 @@ use rayon::prelude::*;
 
 use super::config::OdometryConfig;
 use super::odometer::{Odometer, OdometryError};
-use crate::geometry::wrap_angle;
 use crate::lidar::{FiringOrder, PointTiming, Rotation, RotationDirection, Scan};
 use crate::statistics::median;
 use crate::validation::{InvalidValue, Validate as _};
@@ -28,6 +27,9 @@ pub struct TimingComparison {
     /// Index of the candidate that fits; `None` if the residuals do not decide, as without motion.
     pub best: Option<usize>,
 }
+
+/// Smallest difference between the largest and the least residual that decides, as a share of the least.
+const SPREAD: f64 = 0.05;
 
 /// A run of scans whose timing cannot be compared.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -54,27 +56,48 @@ pub fn compare_timings(
         ..config.clone()
     };
     let runs = Runs { scans, config };
-    let mut residuals_m = vec![(None, runs.mean_residual(None)?)];
     if let Some(period_s) = period_of_order(scans, period_s) {
-        let timing = Some(PointTiming::Order { period_s });
-        residuals_m.push((timing, runs.mean_residual(timing)?));
+        let candidates = [None, Some(PointTiming::Order { period_s })];
+        let residual = |candidate: &Option<PointTiming>| runs.mean_residual(*candidate);
+        let residuals: Result<Vec<f64>, _> = candidates.par_iter().map(residual).collect();
+        let residuals_m = candidates.into_iter().zip(residuals?).collect();
         return Ok(TimingComparison::decided(residuals_m));
     }
     let order = scans.first().and_then(FiringOrder::of);
-    for direction in [
+    let first = |direction| Rotation {
+        direction,
+        period_s,
+        start_rad: (order.as_ref().filter(|it| it.direction == direction))
+            .map_or(PI, |it| it.start_rad),
+    };
+    let directions = [
         RotationDirection::Clockwise,
         RotationDirection::CounterClockwise,
-    ] {
-        let from_order = order.as_ref().filter(|it| it.direction == direction);
-        let rotation = |start_rad| Rotation {
-            direction,
-            period_s,
-            start_rad,
+    ];
+    let (none_m, coarse) = rayon::join(
+        || runs.mean_residual(None),
+        || {
+            let rotations = directions.par_iter().map(|direction| {
+                let first = first(*direction);
+                Ok((first, runs.best_quarter(first)?))
+            });
+            rotations.collect::<Result<Vec<_>, TimingError>>()
+        },
+    );
+    let none_m = none_m?;
+    let fitted = |&(first, coarse): &(Rotation, Fitted)| {
+        // The first start fits: there is nothing to refine. Nor where the best of four is worse than no times: a start that is
+        // off by an eighth of a turn has wrong times for an eighth of the points.
+        let is_done = coarse.0 == first || coarse.1 > (1.0 + SPREAD) * none_m;
+        let (rotation, residual_m) = if is_done {
+            coarse
+        } else {
+            runs.best_start(coarse)?
         };
-        let first = rotation(from_order.map_or(PI, |it| it.start_rad));
-        let (rotation, residual_m) = runs.best_start(first)?;
-        residuals_m.push((Some(PointTiming::Rotation(rotation)), residual_m));
-    }
+        Ok((Some(PointTiming::Rotation(rotation)), residual_m))
+    };
+    let rotations: Result<Vec<_>, TimingError> = coarse?.par_iter().map(fitted).collect();
+    let residuals_m = [(None, none_m)].into_iter().chain(rotations?).collect();
     Ok(TimingComparison::decided(residuals_m))
 }
 
@@ -123,44 +146,41 @@ struct Runs<'a> {
     config: &'a OdometryConfig,
 }
 
+/// A rotation and its mean residual [m].
+type Fitted = (Rotation, f64);
+
 impl Runs<'_> {
-    /// The start of the revolution with the least residual, with it [m]. Points between a wrong start and the right one
-    /// are off by a whole period.
-    fn best_start(&self, first: Rotation) -> Result<(Rotation, f64), TimingError> {
+    /// The start of the revolution with the least residual among a first one and those by quarters of a turn from it. Points
+    /// between a wrong start and the right one are off by a whole period.
+    fn best_quarter(&self, first: Rotation) -> Result<Fitted, TimingError> {
         /// Decrease of the residual by which another start than the first is better (unitless).
         const BETTER: f64 = 0.03;
-        let mut best = (
-            first,
-            self.mean_residual(Some(PointTiming::Rotation(first)))?,
-        );
-        let mut better = BETTER;
-        for turns in [
-            &[FRAC_PI_2, PI, -FRAC_PI_2][..],
-            &[FRAC_PI_4, -FRAC_PI_4],
-            &[0.5 * FRAC_PI_4, -0.5 * FRAC_PI_4],
-        ] {
-            let turned = |turn: &f64| Rotation {
-                start_rad: wrap_angle(best.0.start_rad + turn),
-                ..best.0
-            };
-            let others: Vec<Rotation> = turns.iter().map(turned).collect();
-            let residual = |&other: &Rotation| {
-                let timing = Some(PointTiming::Rotation(other));
-                Ok((other, self.mean_residual(timing)?))
-            };
-            let found: Result<Vec<_>, TimingError> = others.par_iter().map(residual).collect();
-            for (other, residual_m) in found? {
-                if residual_m < (1.0 - better) * best.1 {
-                    best = (other, residual_m);
+        let turned = [0.0, FRAC_PI_2, PI, -FRAC_PI_2].map(|turn| first.turned(turn));
+        let residuals_m = self.residuals_of(&turned)?;
+        let first_m = residuals_m[0];
+        let others = turned.into_iter().zip(residuals_m).skip(1);
+        Ok(others.fold((first, first_m), |best, other| {
+            let is_better = other.1 < (1.0 - BETTER) * best.1;
+            if is_better { other } else { best }
+        }))
+    }
+
+    /// The start with the least residual near one of [`Runs::best_quarter`].
+    fn best_start(&self, mut best: Fitted) -> Result<Fitted, TimingError> {
+        for turn in [FRAC_PI_4, 0.5 * FRAC_PI_4] {
+            let others = [turn, -turn].map(|turn| best.0.turned(turn));
+            for other in others.into_iter().zip(self.residuals_of(&others)?) {
+                if other.1 < best.1 {
+                    best = other;
                 }
             }
-            // The first start fits: there is nothing to refine.
-            if best.0 == first {
-                break;
-            }
-            better = 0.0;
         }
         Ok(best)
+    }
+
+    fn residuals_of(&self, rotations: &[Rotation]) -> Result<Vec<f64>, TimingError> {
+        let residual = |&it: &Rotation| self.mean_residual(Some(PointTiming::Rotation(it)));
+        rotations.par_iter().map(residual).collect()
     }
 
     /// Mean residual of the registered scans; infinite if there are none [m].
@@ -186,8 +206,6 @@ impl Runs<'_> {
 
 /// The least residual, if it is clearly below the next.
 fn decide(residuals_m: &[f64]) -> Option<usize> {
-    /// Smallest difference between the largest and the least residual, as a share of the least.
-    const SPREAD: f64 = 0.05;
     /// Smallest difference between the next and the least residual, as a share of the spread: a quarter for exact
     /// times of uncompensated scans.
     const MARGIN: f64 = 0.2;

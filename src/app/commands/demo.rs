@@ -16,7 +16,7 @@ use crate::app::report::Report;
 use crate::app::report::map::BuildReport;
 use crate::app::run::arguments::yaml;
 use crate::app::run::{Context, Form, MachineArgs, Printed};
-use crate::app::settings::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
+use crate::app::settings::{self, BuildMapConfig, LocalizationConfig};
 use crate::configuration::Configuration;
 use crate::simulation::SimulationConfig;
 
@@ -102,7 +102,8 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
     localize::run(&localization, context).context("while localizing")?;
 
     tracing::info!("refining the trajectory");
-    let refinement = RefinementConfig::of(localization);
+    // With the sensor that was inferred.
+    let refinement = refine::base_config(Some(&localization.result_path));
     let report = refine::run(&refinement, context).context("while refining")?;
 
     let seconds = started.elapsed().as_secs_f64();

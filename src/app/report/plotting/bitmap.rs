@@ -70,7 +70,7 @@ impl Bitmap {
     /// A PNG of few bytes in memory.
     pub fn to_png(&self) -> io::Result<Vec<u8>> {
         let mut bytes = Vec::new();
-        self.encode(&mut bytes, png::Compression::High)?;
+        self.encode(&mut bytes, png::Compression::Balanced)?;
         Ok(bytes)
     }
 
