@@ -84,6 +84,7 @@ impl Level {
 
     /// Calls `visit(sample, cell, position in the cell)` for the samples in cells -1 to `last` (3 or
     /// 4) of a node, in the order of the neighbors.
+    #[inline]
     pub fn for_each_sample_around(
         &self,
         node: usize,

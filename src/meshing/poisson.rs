@@ -198,12 +198,12 @@ fn solve(
     let [depths, finest] = depths.map(|depths| -> Vec<f32> {
         (depths.iter().map(|depth| depth.max(base.depth as f32))).collect()
     });
-    let weights = SampleWeights {
-        depths: &depths,
-        finest: &finest,
-        samples_per_node: config.samples_per_node,
-        point_weight: config.point_weight,
-    };
+    let weights = SampleWeights::new(
+        &depths,
+        &finest,
+        config.samples_per_node,
+        config.point_weight,
+    );
     let mut coarse = CoarseField::base(samples, base, &weights);
     let mut values = vec![base_grid::solve(samples, base.depth, &weights).into_nodes(base)];
     for (index, levels) in tree.levels.windows(2).enumerate() {

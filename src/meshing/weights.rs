@@ -1,31 +1,50 @@
 //! Weights of the samples in the two terms of the screened Poisson energy.
 
+use rayon::prelude::*;
+
 use super::stencil::{interpolate, trilinear};
 
 /// Surface area and screening weight of each sample.
 pub struct SampleWeights<'a> {
-    /// Depth at which a cell face holds `samples_per_node` samples, per sample.
-    pub depths: &'a [f32],
+    /// Surface area of each sample in cell faces of depth 0.
+    areas: Vec<f32>,
     /// Depth of the finest cells at each sample, which is at most its sampling depth.
-    pub finest: &'a [f32],
-    /// Number of samples per cell face at a sample's depth.
-    pub samples_per_node: f32,
+    finest: &'a [f32],
+    /// Area of a sample at its own depth in cell faces.
+    own_area: f32,
     /// Screening weight α.
-    pub point_weight: f32,
+    point_weight: f32,
 }
 
-impl SampleWeights<'_> {
+impl<'a> SampleWeights<'a> {
+    /// Weights of samples with the depths at which a cell face holds `samples_per_node` of them, those of the finest cells
+    /// at each, and the screening weight α.
+    pub fn new(
+        depths: &[f32],
+        finest: &'a [f32],
+        samples_per_node: f32,
+        point_weight: f32,
+    ) -> Self {
+        let own_area = 1.0 / samples_per_node;
+        let area = |depth: &f32| own_area * (-2.0 * depth).exp2();
+        Self {
+            areas: depths.par_iter().map(area).collect(),
+            finest,
+            own_area,
+            point_weight,
+        }
+    }
+
     /// Surface area of a sample in cell faces of a depth.
     #[inline]
     pub fn area(&self, sample: usize, depth: u32) -> f32 {
-        (2.0 * (depth as f32 - self.depths[sample])).exp2() / self.samples_per_node
+        (1_u64 << (2 * depth)) as f32 * self.areas[sample]
     }
 
     /// Weight of a sample in the screening term; it does not increase below the sample's depth.
     #[inline]
     pub fn screening(&self, sample: usize, depth: u32) -> f32 {
-        let finer = (depth as f32 - self.depths[sample]).min(0.0);
-        self.point_weight * (2.0 * finer).exp2() / self.samples_per_node
+        self.point_weight * self.area(sample, depth).min(self.own_area)
     }
 
     /// Fraction of a sample's normal that is splatted at this depth or finer.
