@@ -218,6 +218,65 @@ fn damaged_clouds_a_stall_and_a_proposed_pose_are_survived_and_reported() {
 }
 
 #[test]
+fn a_robot_that_is_carried_elsewhere_is_lost_without_a_pose_and_found_again() {
+    let recording = street();
+    let Some(outcome) = robot(&recording, "kidnapped", &[]) else {
+        return;
+    };
+    let received = &outcome["received"];
+    let expected = ["tracking: ", "lost: ", "tracking: "];
+    let states = &received["/diagnostics"];
+    assert!(states_include(received, &expected), "{states}");
+    // Frames 5 to 34 of the robot's clock were elsewhere: after half a second nothing is believed.
+    let poses = positions(&received["/fpmcl/pose"]);
+    let transforms = received["/tf"].as_array().unwrap().iter();
+    let transforms = transforms.flat_map(|it| positions(it));
+    for (moment, position) in poses.iter().copied().chain(transforms) {
+        assert!(!(10..35).contains(&moment), "{moment} {position:?}");
+        // Then it drove to frame 11 and back to 5.
+        let turn = moment.saturating_sub(35) % 12;
+        let frame = if moment < 35 {
+            moment
+        } else {
+            5 + turn.min(12 - turn)
+        };
+        let expected = [0.5 * frame as f64, 0.0, position[2]];
+        let is_elsewhere = (5..10).contains(&moment);
+        assert!(
+            is_elsewhere || distance_m(position, expected) < 0.1,
+            "{moment} {position:?}"
+        );
+    }
+    assert!(poses.last().unwrap().0 >= 35);
+}
+
+#[test]
+fn a_node_that_is_killed_begins_where_it_was() {
+    let recording = street();
+    // The last pose was written up to a second of driving ago.
+    let widely = [
+        "--set",
+        "numParticles=1000",
+        "--set",
+        "start={position_m: 5, heading_rad: 0.5}",
+    ];
+    let Some(outcome) = robot(&recording, "restarted", &widely) else {
+        return;
+    };
+    let poses = positions(&outcome["received"]["/fpmcl/pose"]);
+    let frames: Vec<usize> = poses.iter().map(|it| it.0).collect();
+    // The first scans afterwards confirm where it is.
+    assert!(frames.starts_with(&[0, 1, 2, 3, 4, 5]), "{frames:?}");
+    assert!(frames.ends_with(&[9, 10, 11]), "{frames:?}");
+    for (frame, [x, y, _]) in poses {
+        let error_m = (x - 0.5 * frame as f64).hypot(y);
+        assert!(error_m < 0.1, "{frame} {x} {y}");
+    }
+    let stderr = outcome["stderr"].as_str().unwrap();
+    assert!(!stderr.contains("start is searched"), "{stderr}");
+}
+
+#[test]
 fn with_wheels_poses_are_those_of_the_base_and_the_transform_is_that_of_its_odometry_alone() {
     let recording = street();
     let Some(outcome) = robot(&recording, "wheels", &["--odometry=/odom"]) else {

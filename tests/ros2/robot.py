@@ -7,12 +7,14 @@ It runs only where the loopback is the only network interface, because DDS annou
 """
 
 import json
+import math
 import pathlib
 import signal
 import subprocess
 import sys
 import threading
 import time
+from array import array as array_of
 from dataclasses import dataclass
 
 from cyclonedds.core import Policy, Qos
@@ -220,7 +222,7 @@ def receive():
             # At its end the program takes back what it said: samples without data.
             for message in filter(lambda it: it.sample_info.valid_data, of_topic.take(100)):
                 print(json.dumps([topic, described(topic, message)]), flush=True)
-        matched = sum(bool(it.get_matched_publications()) for it in readers.values())
+        matched = {topic: it.get_matched_publications() for topic, it in readers.items()}
         print(json.dumps(["matched", matched]), flush=True)
         time.sleep(0.02)
 
@@ -232,7 +234,7 @@ class Receiver:
         command = [sys.executable, __file__, "receive"]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         self.messages = {}
-        self.matched = 0
+        self.matched = {}
         threading.Thread(target=self.read, daemon=True).start()
 
     def read(self):
@@ -259,6 +261,11 @@ class Receiver:
         self.wait(words, lambda: any(words in it["message"] for it in self.of("/diagnostics")[after:]))
         return len(self.of("/diagnostics"))
 
+    def wait_for_program(self, before):
+        """Waits for writers of all topics that the program offers, besides those of before."""
+        is_new = lambda topic, of_topic: topic == "/tf" or set(of_topic) - set(before.get(topic, []))
+        self.wait("the topics of the program", lambda: self.matched and all(map(is_new, *zip(*self.matched.items()))))
+
     def has_pose(self, time_ns):
         return any(it["stamp_ns"] == time_ns for it in self.of("/fpmcl/pose"))
 
@@ -278,16 +285,16 @@ class Robot:
         self.transforms = writer(self.participant, "/tf", TFMessage, USUAL)
         self.static = writer(self.participant, "/tf_static", TFMessage, LATCHED)
         self.odometry = writer(self.participant, "/odom", Odometry, USUAL)
-        receiver.wait("the topics of the program", lambda: receiver.matched == 5)
+        receiver.wait_for_program({})
         receiver.wait("the reader of clouds", self.clouds.get_matched_subscriptions)
         receiver.wait("the reader of proposals", self.proposals.get_matched_subscriptions)
 
     def moment(self, frame, later_ns=0):
         return 10**9 + self.PERIOD_NS * frame + later_ns
 
-    def cloud(self, frame, later_ns=0, cut=0):
-        """Sends a scan; of which the last bytes are missing."""
-        data = self.scans[frame].read_bytes()
+    def cloud(self, frame, later_ns=0, cut=0, elsewhere=None):
+        """Sends a scan; of which the last bytes are missing, or which is that of another place."""
+        data = self.scans[frame].read_bytes() if elsewhere is None else elsewhere
         fields = [PointField(name, 4 * k, 7, 1) for k, name in enumerate(["x", "y", "z", "intensity"])]
         count = len(data) // 16
         header = Header(stamp(self.moment(frame, later_ns)), "lidar")
@@ -333,12 +340,12 @@ class Wheeled(Robot):
             self.odometry.write(Odometry(header, "base_link", with_covariance, still))
 
 
-def drive(folder, receiver):
+def drive(folder, receiver, _program):
     robot = Robot(folder, receiver)
     robot.drive(range(12))
 
 
-def events(folder, receiver):
+def events(folder, receiver, _program):
     """A damaged cloud, one that is none, a stall, and a pose that is proposed."""
     robot = Robot(folder, receiver)
     robot.drive(range(5))
@@ -368,24 +375,95 @@ def events(folder, receiver):
     robot.drive([11], later_ns)
 
 
-def wheels(folder, receiver):
+def hall(length_m=19.0, width_m=7.0):
+    """A scan of 16 beams inside a hall, in the middle of which the sensor turned by 30 degrees."""
+    points = []
+    for beam in range(16):
+        elevation = math.radians(2.0 * beam - 15.0)
+        for step in range(600):
+            heading = math.radians(0.6 * step)
+            x, y, z = math.cos(heading), math.sin(heading), math.tan(elevation)
+            floor = -1.7 / z if z < 0.0 else math.inf
+            wall = min(0.5 * length_m / max(abs(x), 1e-9), 0.5 * width_m / max(abs(y), 1e-9))
+            far = min(floor, wall)
+            turned = heading + math.radians(30.0)
+            points += [far * math.cos(turned), far * math.sin(turned), far * z, 0.0]
+    return array_of("f", points).tobytes()
+
+
+def kidnapped(folder, receiver, _program):
+    """Three seconds elsewhere, then back."""
+    robot = Robot(folder, receiver)
+    robot.drive(range(5))
+    elsewhere = hall()
+    for k in range(30):
+        robot.cloud(5, later_ns=k * robot.PERIOD_NS, elsewhere=elsewhere)
+        time.sleep(0.1)
+    receiver.wait_for_state("lost: ")
+    # To frame 11 and back to 5, until it is found.
+    for k in range(120):
+        frame = 5 + min(k % 12, 12 - k % 12)
+        moment = 35 + k
+        robot.cloud(frame, later_ns=(moment - frame) * robot.PERIOD_NS)
+        time.sleep(0.1)
+        if any(receiver.has_pose(robot.moment(it)) for it in range(35, moment)):
+            return
+    sys.exit("not found again")
+
+
+def restarted(folder, receiver, program):
+    """The program is killed on the way, and started again where it was."""
+    robot = Robot(folder, receiver)
+    robot.drive(range(6))
+    last = pathlib.Path("live/last_pose.json")
+    receiver.wait("the last pose", last.exists)
+    readers, writers = set(robot.clouds.get_matched_subscriptions()), receiver.matched
+    program.restart(["--start=last", "--force"])
+    receiver.wait_for_program(writers)
+    receiver.wait("the new reader of clouds", lambda: set(robot.clouds.get_matched_subscriptions()) - readers)
+    robot.drive(range(6, 12))
+
+
+def wheels(folder, receiver, _program):
     robot = Wheeled(folder, receiver)
     robot.place()
     robot.drive(range(12))
 
 
+class Program:
+    """The program that is tried."""
+
+    def __init__(self, command):
+        self.command = command
+        self.start([])
+
+    def start(self, more):
+        self.process = subprocess.Popen([*self.command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    def restart(self, more):
+        """Kills it, and starts it again with another start and further arguments."""
+        self.process.kill()
+        self.process.communicate()
+        self.command = [it for it in self.command if not it.startswith("--start=")]
+        self.start(more)
+
+
 def play(folder, scenario, command):
-    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    program = Program(command)
     receiver = Receiver()
     try:
-        scenario(folder, receiver)
-        program.send_signal(signal.SIGTERM)
-        stdout, stderr = program.communicate(timeout=120)
+        scenario(folder, receiver, program)
+        program.process.send_signal(signal.SIGTERM)
+        stdout, stderr = program.process.communicate(timeout=120)
+    except SystemExit as failed:
+        program.process.kill()
+        sys.exit(f"{failed}; the program says: {program.process.communicate()[1]}")
     finally:
-        program.kill()
+        program.process.kill()
         receiver.process.kill()
-    if program.returncode != 0:
-        sys.exit(f"the program ends with {program.returncode}: {stderr}")
+    # 3: less than half is localized.
+    if program.process.returncode not in (0, 3):
+        sys.exit(f"the program ends with {program.process.returncode}: {stderr}")
     print(json.dumps({"received": receiver.messages, "report": json.loads(stdout), "stderr": stderr}))
 
 
@@ -400,4 +478,5 @@ if __name__ == "__main__":
     if sys.argv[1] == "receive":
         receive()
     folder, scenario = sys.argv[2:4]
-    play(folder, {"drive": drive, "events": events, "wheels": wheels}[scenario], sys.argv[5:])
+    scenarios = {it.__name__: it for it in [drive, events, kidnapped, restarted, wheels]}
+    play(folder, scenarios[scenario], sys.argv[5:])

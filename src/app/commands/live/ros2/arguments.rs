@@ -32,6 +32,10 @@ pub struct Ros2Args {
     #[arg(long, value_name = "FRAME", default_value = "base_link")]
     pub base_frame: String,
 
+    /// Time after a scan for which its transform is sent, with the motion going on until then [s]: a consumer finds one for now.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = tolerance)]
+    pub transform_tolerance: f64,
+
     /// Another name of a topic of ROS 2; repeatable.
     #[arg(long, value_name = "FROM:=TO", value_parser = remapping)]
     pub remap: Vec<(String, String)>,
@@ -91,6 +95,13 @@ pub(super) fn topic(text: &str) -> Result<String, &'static str> {
         Ok(format!("/{absolute}"))
     } else {
         Err("give the name of a topic, such as /points")
+    }
+}
+
+fn tolerance(text: &str) -> Result<f64, &'static str> {
+    match text.parse::<f64>() {
+        Ok(number) if (0.0..=10.0).contains(&number) => Ok(number),
+        _ => Err("give seconds from 0 to 10, such as 0.2"),
     }
 }
 

@@ -147,6 +147,22 @@ impl Node {
         names
     }
 
+    /// Other types than this one with which others offer or read a topic.
+    pub fn other_types_of(&self, topic: &str, message_type: &str) -> Vec<String> {
+        let topics = self.participant.discovered_topics();
+        let of_topic = topics
+            .iter()
+            .filter(|it| *it.topic_name() == wire_topic(topic));
+        let mut types: Vec<String> = of_topic
+            .map(|it| it.type_name().replace("::dds_::", "::").replace("::", "/"))
+            .map(|it| it.trim_end_matches('_').to_owned())
+            .filter(|it| it != message_type)
+            .collect();
+        types.sort();
+        types.dedup();
+        types
+    }
+
     /// Offers a topic by its name and type on the wire.
     fn raw_writer(
         &mut self,

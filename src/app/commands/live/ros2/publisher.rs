@@ -38,6 +38,8 @@ pub struct Publisher<'a> {
     transforms: Writer,
     diagnostics: Writer,
     map: Writer,
+    /// Time after a scan for which its transform is [s].
+    tolerance_s: f64,
     /// The reason of the last diagnostics, and when they were sent.
     last: Option<(Reason, Instant)>,
 }
@@ -71,6 +73,7 @@ impl<'a> Publisher<'a> {
                 Quality::Latched,
                 1,
             )?,
+            tolerance_s: args.transform_tolerance,
             last: None,
         })
     }
@@ -131,7 +134,9 @@ impl<'a> Publisher<'a> {
         let covariance = covariance_of_child(&estimate.covariance, &lever);
         let pose = Cdr::with_header(stamp_ns, map).pose(&map_from_child);
         self.pose.send(pose.covariance(&covariance));
-        let [linear, angular] = velocity(estimate.motion.as_ref(), &lidar_from_child);
+        let motion = estimate.motion.as_ref();
+        let motion = motion.map(|it| of_child(it, &lidar_from_child));
+        let [linear, angular] = velocity(motion.as_ref());
         let odometry = Cdr::with_header(stamp_ns, map).text(&place.child);
         let odometry = odometry.pose(&map_from_child).covariance(&covariance);
         let odometry = odometry
@@ -143,8 +148,12 @@ impl<'a> Publisher<'a> {
             Some((_, None)) => return,
             // A driver may name no frame.
             None if place.child.is_empty() => return,
-            None => (&place.child, map_from_child),
+            None => {
+                let ahead = motion.map_or_else(Pose3::identity, |it| it.after(self.tolerance_s));
+                (&place.child, map_from_child * ahead)
+            }
         };
+        let stamp_ns = stamp_ns.saturating_add((1e9 * self.tolerance_s) as u64);
         let message = Cdr::default().u32(1).header(stamp_ns, map).text(child);
         self.transforms.send(message.pose(&transform));
     }
@@ -205,12 +214,21 @@ fn covariance_of_child(of_lidar: &Matrix3<f64>, d: &Vector3<f64>) -> Matrix6<f64
     covariance
 }
 
-/// Velocity [m/s] and turn rate [rad/s] of the child frame in itself; zero while they are not known.
-fn velocity(motion: Option<&Motion>, lidar_from_child: &Pose3) -> [Vector3<f64>; 2] {
+/// Motion of the child frame.
+fn of_child(of_lidar: &Motion, lidar_from_child: &Pose3) -> Motion {
+    let moved = of_lidar.previous_from_current;
+    Motion {
+        previous_from_current: lidar_from_child.inverse() * moved * lidar_from_child,
+        duration_s: of_lidar.duration_s,
+    }
+}
+
+/// Velocity [m/s] and turn rate [rad/s] of a motion; zero while it is not known.
+fn velocity(motion: Option<&Motion>) -> [Vector3<f64>; 2] {
     let Some(motion) = motion else {
         return [Vector3::zeros(); 2];
     };
-    let moved = lidar_from_child.inverse() * motion.previous_from_current * lidar_from_child;
+    let moved = &motion.previous_from_current;
     let [linear, angular] = [moved.translation.vector, moved.rotation.scaled_axis()];
     [linear / motion.duration_s, angular / motion.duration_s]
 }
@@ -311,9 +329,9 @@ mod tests {
             duration_s: 0.1,
         };
         let ahead = Pose3::translation(2.0, 0.0, 0.0);
-        let [linear, angular] = velocity(Some(&motion), &ahead);
+        let [linear, angular] = velocity(Some(&of_child(&motion, &ahead)));
         assert_relative_eq!(linear, Vector3::new(0.0, 0.02, 0.0), epsilon = 1e-4);
         assert_relative_eq!(angular, Vector3::new(0.0, 0.0, 0.01), epsilon = 1e-9);
-        assert_eq!(velocity(None, &ahead), [Vector3::zeros(); 2]);
+        assert_eq!(velocity(None), [Vector3::zeros(); 2]);
     }
 }

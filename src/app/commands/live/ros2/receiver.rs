@@ -23,21 +23,23 @@ use crate::recording::{Frame, ScanSource};
 /// Longest time between two looks at the topics and at whether it is requested to stop.
 const POLL: Duration = Duration::from_millis(20);
 
-/// Time without a cloud after which the existing topics are reported.
+/// Time without a message of a topic after which the existing ones are reported.
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Number of messages of a topic that are read in a row.
 const MOST_AT_ONCE: usize = 1000;
 
-/// Type of clouds.
+/// Types of the topics that are watched.
 const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
+const ODOMETRY: &str = "nav_msgs/msg/Odometry";
 
 /// The topics that are read.
 pub struct Receiver {
     /// Name of the topic of the clouds.
     topic: String,
     clouds: Reader,
-    odometry: Option<Reader>,
+    cloud_watch: Watch,
+    odometry: Option<(Reader, Watch)>,
     transforms: Reader,
     static_transforms: Reader,
     proposals: Reader,
@@ -51,7 +53,14 @@ struct Warned {
     /// Topics with damaged messages.
     of_messages: BTreeSet<String>,
     of_times: bool,
-    of_silence: bool,
+}
+
+/// Watches that messages of a topic arrive.
+struct Watch {
+    topic: String,
+    message_type: &'static str,
+    last: Instant,
+    has_warned: bool,
 }
 
 impl Warned {
@@ -61,7 +70,7 @@ impl Warned {
         topic: &str,
         reader: &Reader,
         read: impl Fn(&[u8]) -> Result<T, String>,
-        take: impl Fn(T),
+        mut take: impl FnMut(T),
     ) {
         for message in iter::from_fn(|| reader.take()).take(MOST_AT_ONCE) {
             match message.and_then(|message| read(&message)) {
@@ -81,6 +90,44 @@ impl Warned {
     }
 }
 
+impl Watch {
+    fn new(topic: &str, message_type: &'static str) -> Self {
+        Self {
+            topic: topic.to_owned(),
+            message_type,
+            last: Instant::now(),
+            has_warned: false,
+        }
+    }
+
+    /// Notes that a message has arrived.
+    fn heard(&mut self) {
+        (self.last, self.has_warned) = (Instant::now(), false);
+    }
+
+    /// Warns, once per silence, of what follows from it, with the topics that exist.
+    fn check(&mut self, node: &Node, consequence: &str) {
+        if self.last.elapsed() <= PATIENCE || std::mem::replace(&mut self.has_warned, true) {
+            return;
+        }
+        let (topic, message_type) = (&self.topic, self.message_type);
+        let of_others = node.other_types_of(topic, message_type);
+        let mut others = node.topics_of(message_type);
+        others.retain(|it| it != topic && !it.starts_with("/fpmcl/"));
+        let found = if let Some(other) = of_others.first() {
+            format!("others send {other} there")
+        } else if others.is_empty() {
+            "no topic of this type was found: check the domain, the interface, and that its sender runs".to_owned()
+        } else {
+            format!("topics of this type are {}", others.join(", "))
+        };
+        tracing::warn!(
+            "no {message_type} has arrived on {topic} for {} s{consequence}; {found}",
+            PATIENCE.as_secs()
+        );
+    }
+}
+
 impl Receiver {
     /// Subscribes to the topics.
     pub fn new(
@@ -95,10 +142,15 @@ impl Receiver {
         };
         const TRANSFORMS: &str = "tf2_msgs/msg/TFMessage";
         let odometry = odometry
-            .map(|topic| reader(topic, "nav_msgs/msg/Odometry", Quality::BestEffort, 100))
+            .map(|topic| {
+                let watch = Watch::new(args.remapped(topic), ODOMETRY);
+                anyhow::Ok((reader(topic, ODOMETRY, Quality::BestEffort, 100)?, watch))
+            })
             .transpose()?;
+        let topic = args.remapped(clouds);
         Ok(Self {
-            topic: args.remapped(clouds).to_owned(),
+            topic: topic.to_owned(),
+            cloud_watch: Watch::new(topic, CLOUD),
             clouds: reader(clouds, CLOUD, Quality::BestEffort, 5)?,
             odometry,
             transforms: reader("/tf", TRANSFORMS, Quality::BestEffort, 100)?,
@@ -125,7 +177,6 @@ impl Receiver {
     ) {
         let waker = waker();
         let mut number = 0;
-        let mut last_cloud = Instant::now();
         while !interrupt.requested() && !inbox.is_closed() {
             let readers = [
                 &self.clouds,
@@ -133,7 +184,10 @@ impl Receiver {
                 &self.static_transforms,
                 &self.proposals,
             ];
-            for reader in readers.into_iter().chain(&self.odometry) {
+            for reader in readers
+                .into_iter()
+                .chain(self.odometry.iter().map(|it| &it.0))
+            {
                 reader.wakes(&waker);
             }
             self.receive_all_but_clouds(shared);
@@ -162,10 +216,12 @@ impl Receiver {
                 number += 1;
             }
             if has_received {
-                last_cloud = Instant::now();
-                self.warned.of_silence = false;
+                self.cloud_watch.heard();
+                if let Some((_, watch)) = &mut self.odometry {
+                    watch.check(node, ": the motion is that of the scans");
+                }
             } else {
-                self.warn_of_silence(node, last_cloud.elapsed() > PATIENCE);
+                self.cloud_watch.check(node, "");
                 thread::park_timeout(POLL);
             }
         }
@@ -185,9 +241,10 @@ impl Receiver {
         warned.receive("/tf", &self.transforms, read_transforms, |it| {
             shared.transforms(it);
         });
-        if let Some(odometry) = &self.odometry {
+        if let Some((odometry, watch)) = &mut self.odometry {
             warned.receive("the odometry", odometry, read_odometry, |it| {
                 shared.odometry(it);
+                watch.heard();
             });
         }
         let propose = |(pose, deviations)| shared.propose(pose, deviations);
@@ -212,24 +269,5 @@ impl Receiver {
         // A scan of a robot is not kept.
         let source = ScanSource::Memory(Default::default());
         (Frame::new(number, source, time_s), scan)
-    }
-
-    /// Warns, once per silence, with the topics that have clouds.
-    fn warn_of_silence(&mut self, node: &Node, is_silent: bool) {
-        if !is_silent || std::mem::replace(&mut self.warned.of_silence, true) {
-            return;
-        }
-        let mut others = node.topics_of(CLOUD);
-        others.retain(|it| *it != self.topic && !it.starts_with("/fpmcl/"));
-        let found = if others.is_empty() {
-            "no topic with clouds was found: check the domain, the interface, and that the sensor runs".to_owned()
-        } else {
-            format!("topics with clouds are {}", others.join(", "))
-        };
-        tracing::warn!(
-            "no cloud has arrived on {} for {} s; {found}",
-            self.topic,
-            PATIENCE.as_secs()
-        );
     }
 }
