@@ -28,15 +28,6 @@ pub struct ElevationBias {
     pub sigma_deg: f64,
 }
 
-impl ElevationBias {
-    /// Whether it is certain, and large enough to bend a trajectory.
-    pub fn is_significant(&self) -> bool {
-        const SIGMAS: f64 = 4.0;
-        const LEAST_DEG: f64 = 0.1;
-        self.deg.abs() > (SIGMAS * self.sigma_deg).max(LEAST_DEG)
-    }
-}
-
 /// Finds the bias at poses for which the system of equations was set up, with the information `scale` of a residual
 /// [1/m²]; `None` if it does not follow from the scans.
 pub fn elevation_bias(

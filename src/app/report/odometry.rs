@@ -13,7 +13,7 @@ use super::run_output::{RunFiles, Trajectory as WrittenTrajectory, stamped};
 use crate::app::run::output;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::mapping::{LostPath, TrajectorySummary};
-use crate::odometry::{ElevationBias, Loop, OdometryEstimate, StepState, Trajectory};
+use crate::odometry::{Loop, OdometryEstimate, StepState, Trajectory};
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, Recording};
 use crate::sensor::Sensor;
@@ -119,7 +119,7 @@ pub fn rows(summary: &TrajectorySummary) -> Vec<(&'static str, String)> {
     rows
 }
 
-/// Warns of scans that could not be registered, or of a path that is lost by them, and says what may be wrong with the elevations.
+/// Warns of scans that could not be registered, or of a path that is lost by them.
 pub fn warn(summary: &TrajectorySummary, lost: Option<&LostPath>) {
     match lost {
         Some(lost) => tracing::warn!("the path is not to be trusted: {lost}"),
@@ -137,13 +137,8 @@ pub fn warn(summary: &TrajectorySummary, lost: Option<&LostPath>) {
             summary.scans
         );
     }
-    if let Some(bias) = summary.elevation_bias.filter(ElevationBias::is_significant) {
-        tracing::info!(
-            "surfaces fit themselves better with {:.2} degrees added to the elevations of all points: try elevation_bias_deg",
-            bias.deg
-        );
-    }
 }
+
 /// Writes the poses of the selected frames.
 pub fn write(
     files: &RunFiles,
