@@ -38,7 +38,10 @@ fn a_map_is_built_and_the_car_is_localized_in_it() {
 
 #[test]
 fn a_missing_input_is_reported_with_its_key_and_nothing_is_written() {
-    for (name, key) in [("poses.txt", "pose_file"), ("calib.txt", "calib_file")] {
+    for (name, key) in [
+        ("poses.txt", "pose_file (--poses, --truth)"),
+        ("calib.txt", "calib_file (--calib)"),
+    ] {
         let recording = Recording::street(2);
         fs::remove_file(recording.path(name)).unwrap();
         let message = format!("{key} is {name}, but there is no such file");
