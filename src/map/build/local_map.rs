@@ -414,7 +414,7 @@ fn simplify_and_colour(
     counts: &mut LocalMapCounts,
 ) {
     let cell_m = config.max_distance_m.max(2.0 * config.voxel_size_m);
-    let confidences = GroundConfidences::new(cloud, cell_m);
+    let confidences = GroundConfidences::new(cloud, cell_m, CELL_PER_DISTANCE * MAX_CROP_M);
     let threshold = config.ground_threshold;
     let before = mesh.triangles.len();
     if config.simplify_resolution_m > 0.0 {

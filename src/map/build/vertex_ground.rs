@@ -1,6 +1,7 @@
 //! Ground confidences and colours of vertices, and the ground triangles of a mesh.
 //!
-//! The confidence of a vertex is the mean over the points around it, of all scans. Its colour is
+//! The confidence of a vertex is the mean over the points around it, of all scans, in the smallest cells that have any: far from
+//! the path points are farther apart. Its colour is
 //! interpolated between the colours of rest and ground and changes sides at the threshold: the stronger
 //! of the two shows the classification.
 
@@ -18,43 +19,62 @@ pub(crate) const REST: [u8; 3] = [0, 0, 255];
 /// bytes.
 const MIN_CONTRAST: f32 = 0.01;
 
-/// Mean ground confidences of points in cells.
+/// Mean ground confidences of points in cells of several sizes, each twice as large as the one before.
 pub(crate) struct GroundConfidences {
     cell_m: f32,
-    /// Sum and number of the confidences of each cell.
-    cells: HashMap<IVec3, (f32, f32)>,
+    /// Sum and number of the confidences of each cell, per size.
+    levels: Vec<HashMap<IVec3, (f32, f32)>>,
 }
 
 impl GroundConfidences {
-    /// The means of a cloud in cells of an edge.
-    pub(crate) fn new(cloud: &PointCloud, cell_m: f32) -> Self {
-        let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::with_capacity(cloud.len() / 4);
+    /// The means of a cloud in cells with edges from one to a larger one [m].
+    pub(crate) fn new(cloud: &PointCloud, cell_m: f32, largest_m: f32) -> Self {
+        let mut finest: HashMap<IVec3, (f32, f32)> = HashMap::with_capacity(cloud.len() / 4);
         for (&position, &ground) in cloud.positions.iter().zip(&cloud.ground) {
-            let cell = cells.entry(cell_of(position, cell_m)).or_default();
+            let cell = finest.entry(cell_of(position, cell_m)).or_default();
             cell.0 += ground;
             cell.1 += 1.0;
         }
-        Self { cell_m, cells }
+        let mut levels = vec![finest];
+        let count = (largest_m / cell_m).log2().ceil().max(0.0) as usize;
+        for level in 0..count {
+            let mut coarser: HashMap<IVec3, (f32, f32)> = HashMap::new();
+            let mut cells: Vec<_> = levels[level].iter().collect();
+            // The order of a sum decides its rounding.
+            cells.sort_unstable_by_key(|(cell, _)| cell.to_array());
+            for (cell, (sum, count)) in cells {
+                let cell = coarser.entry(*cell >> 1).or_default();
+                cell.0 += sum;
+                cell.1 += count;
+            }
+            levels.push(coarser);
+        }
+        Self { cell_m, levels }
     }
 
     /// Returns per vertex the mean ground confidence, 0 to 1, of the points in its cell, or else in the
-    /// cells around it; 0 where there are none.
+    /// cells around it, of the smallest size that has any; 0 where there are none.
     pub(crate) fn of(&self, vertices: &[Vec3]) -> Vec<f32> {
         let around: Vec<IVec3> = (0..27)
             .map(|i| IVec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1))
             .collect();
+        let mean = |(sum, count): (f32, f32)| (count > 0.0).then(|| sum / count);
+        let near = |(level, vertex): (usize, Vec3)| {
+            let cells = &self.levels[level];
+            let center = cell_of(vertex, self.cell_m) >> level as i32;
+            let own = cells.get(&center).copied();
+            mean(own.unwrap_or_else(|| {
+                around
+                    .iter()
+                    .filter_map(|offset| cells.get(&(center + offset)))
+                    .fold((0.0, 0.0), |sum, cell| (sum.0 + cell.0, sum.1 + cell.1))
+            }))
+        };
         vertices
             .par_iter()
             .map(|&vertex| {
-                let center = cell_of(vertex, self.cell_m);
-                let own = self.cells.get(&center).copied();
-                let (sum, count) = own.unwrap_or_else(|| {
-                    around
-                        .iter()
-                        .filter_map(|offset| self.cells.get(&(center + offset)))
-                        .fold((0.0, 0.0), |sum, cell| (sum.0 + cell.0, sum.1 + cell.1))
-                });
-                if count > 0.0 { sum / count } else { 0.0 }
+                let mut levels = (0..self.levels.len()).map(|level| (level, vertex));
+                levels.find_map(near).unwrap_or(0.0)
             })
             .collect()
     }
@@ -102,6 +122,32 @@ pub(crate) fn ground_triangles(
 mod tests {
     use super::*;
 
+    #[test]
+    fn a_vertex_between_sparse_points_has_the_confidence_of_the_nearest_ones() {
+        let mut cloud = PointCloud::default();
+        // A road 60 m away, along rings that are 1.5 m apart, and a wall beside it.
+        for ring in 0..10 {
+            for step in 0..100 {
+                let (x, y) = (60.0 + 1.5 * ring as f32, 0.1 * step as f32);
+                cloud.push(Vec3::new(x, y, 0.0), Vec3::Z, 0.9);
+            }
+        }
+        for step in 0..100 {
+            let position = Vec3::new(60.0 + 0.15 * step as f32, 12.0, 3.0);
+            cloud.push(position, Vec3::Y, 0.1);
+        }
+        let between = [Vec3::new(60.75, 5.0, 0.0), Vec3::new(65.25, 2.0, 0.05)];
+        let finest = GroundConfidences::new(&cloud, 0.25, 0.25);
+        assert_eq!(finest.of(&between), [0.0; 2]);
+        let confidences = GroundConfidences::new(&cloud, 0.25, 2.0);
+        for confidence in confidences.of(&between) {
+            assert!((confidence - 0.9).abs() < 1e-6, "{confidence}");
+        }
+        let on_wall = confidences.of(&[Vec3::new(64.0, 12.0, 3.0)]);
+        assert!((on_wall[0] - 0.1).abs() < 1e-6);
+        assert_eq!(confidences.of(&[Vec3::new(30.0, 5.0, 0.0)]), [0.0]);
+    }
+
     const RED: [u8; 3] = [255, 0, 0];
     const BLUE: [u8; 3] = [0, 0, 255];
 
@@ -113,7 +159,7 @@ mod tests {
         }
         // In the cell of three points, in the cell of one, next to it, and far from all.
         let vertices = [0.05, 5.2, 5.45, 9.0].map(|x| Vec3::new(x, 0.1, 0.1));
-        let means = GroundConfidences::new(&cloud, 0.25).of(&vertices);
+        let means = GroundConfidences::new(&cloud, 0.25, 0.25).of(&vertices);
         for (mean, expected) in means.into_iter().zip([0.7, 0.2, 0.2, 0.0]) {
             assert!((mean - expected).abs() < 1e-6, "{mean} for {expected}");
         }
