@@ -23,9 +23,15 @@ pub fn trim_by_distance(
     least_m: f32,
     largest_m: impl Fn(Vec3) -> f32 + Sync,
 ) -> usize {
-    let grid = SampleGrid::new(samples, least_m);
-    let is_near: Vec<bool> = (mesh.vertices.par_iter())
-        .map(|&vertex| grid.has_sample_within(vertex, largest_m(vertex).max(least_m)))
+    /// Largest radius in cells of the grid: beyond it too many columns are looked at.
+    const CELLS: f32 = 8.0;
+    let radii_m: Vec<f32> = (mesh.vertices.par_iter())
+        .map(|&vertex| largest_m(vertex).max(least_m))
+        .collect();
+    let widest_m = radii_m.iter().copied().fold(least_m, f32::max);
+    let grid = SampleGrid::new(samples, least_m.max(widest_m / CELLS));
+    let is_near: Vec<bool> = (mesh.vertices.par_iter().zip(&radii_m))
+        .map(|(&vertex, &radius_m)| grid.has_sample_within(vertex, radius_m))
         .collect();
     mesh.retain_triangles(|_, triangle| triangle.iter().all(|&v| is_near[v as usize]))
 }
