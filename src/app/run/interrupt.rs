@@ -34,8 +34,8 @@ const SIGNALS: [i32; 10] = [
 /// Time from the request to stop until the process ends.
 const GRACE: Duration = Duration::from_millis(1500);
 
-/// Longest time that the last message takes: a terminal may be stopped, or a pipe full.
-const LAST_WORDS: Duration = Duration::from_millis(200);
+/// Longest time that the end of a process waits for a message: a terminal may be stopped, or a pipe full.
+const MESSAGE_WAIT: Duration = Duration::from_millis(200);
 
 /// Time between two looks at the request.
 const POLL: Duration = Duration::from_millis(20);
@@ -91,7 +91,7 @@ impl Interrupt {
         }
         let watched = self.clone();
         thread::spawn(move || watched.exit_when_overdue());
-        // Nobody may read what is written: neither the next signal nor the end of the process waits for it.
+        // The reader of the messages may have stopped: neither the next signal nor the end of the process waits for it.
         thread::spawn(|| {
             tracing::warn!(
                 "interrupted: keeping what is finished; press Ctrl-C again to stop at once"
@@ -176,7 +176,7 @@ impl Interrupt {
                 if self.shared.is_overdue.load(Ordering::SeqCst) {
                     match save() {
                         Ok(kept) => self.keeps(kept),
-                        Err(error) => tracing::error!("{error:#}"),
+                        Err(error) => report(format!("{error:#}")),
                     }
                     self.exit_after_saving();
                 }
@@ -206,15 +206,19 @@ impl Interrupt {
     fn exit_after_saving(&self) -> ! {
         let _saving = self.saving();
         files::abandon_writes();
-        let (written, last_words) = channel::<()>();
-        let error = self.error();
-        thread::spawn(move || {
-            tracing::error!("{error}");
-            drop(written);
-        });
-        let _ = last_words.recv_timeout(LAST_WORDS);
+        report(self.error().to_string());
         exit()
     }
+}
+
+/// Reports an error, and waits for its reader a while only.
+fn report(error: String) {
+    let (sender, written) = channel::<()>();
+    thread::spawn(move || {
+        tracing::error!("{error}");
+        drop(sender);
+    });
+    let _ = written.recv_timeout(MESSAGE_WAIT);
 }
 
 /// A bit for each signal that was ignored at the start, as `nohup` and shells ask for, the first for signal 1; none where
