@@ -30,7 +30,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             "{}: {:.2} {:.2} +- {:.3?} {state}",
             frame.number, t.x, t.y, deviations
         );
-        // Only what is believed is a pose.
+        // Poses while the filter searches are not to be used.
         if estimate.state == State::Tracking {
             trajectory.push(frame.stamped(estimate.map_from_lidar));
         }

@@ -183,16 +183,16 @@ fn commits_of_the_pages_are_in_the_history() {
         skipped("this is no git checkout with its history");
         return;
     }
-    // Digits alone are one where they are called so.
+    // A hash may have digits only.
     let is_commit = |[before, word]: &[&str; 2]| {
         let has = |is: fn(&u8) -> bool| word.bytes().any(|byte| is(&byte));
-        let is_called_so = || ["commit", "at", "of"].contains(before) && word.len() == 7;
+        let follows_its_name = || ["commit", "at", "of"].contains(before) && word.len() == 7;
         (7..=40).contains(&word.len())
             && word
                 .bytes()
                 .all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
             && has(u8::is_ascii_digit)
-            && (has(u8::is_ascii_lowercase) || is_called_so())
+            && (has(u8::is_ascii_lowercase) || follows_its_name())
     };
     let mut count = 0;
     let mut missing = Vec::new();

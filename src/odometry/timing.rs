@@ -86,8 +86,8 @@ pub fn compare_timings(
     );
     let none_m = none_m?;
     let fitted = |&(first, coarse): &(Rotation, Fitted)| {
-        // The first start fits: there is nothing to refine. Nor where the best of four is worse than no times: a start that is
-        // off by an eighth of a turn has wrong times for an eighth of the points.
+        // The first start fits: there is nothing to refine. Nor where the best of four is clearly worse than no times: a start
+        // that is off by an eighth of a turn has wrong times for an eighth of the points.
         let is_done = coarse.0 == first || coarse.1 > (1.0 + SPREAD) * none_m;
         let (rotation, residual_m) = if is_done {
             coarse

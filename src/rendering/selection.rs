@@ -21,7 +21,7 @@ pub struct BackendChoice {
     pub adapter: Option<usize>,
     /// Reason, to be read after "because".
     pub reason: String,
-    /// All graphics adapters of this machine, best first.
+    /// All graphics adapters of this machine, best first; with `auto`, none where it has no graphics card.
     pub adapters: Vec<AdapterReport>,
     /// What was requested.
     pub request: (Backend, RenderingMethod),

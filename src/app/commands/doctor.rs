@@ -108,7 +108,10 @@ pub fn run(args: &DoctorArgs, context: &Context) -> Result<Printed> {
         has_graphics_support: cfg!(feature = "gpu"),
         backend_auto: choice.name(),
         backend_reason: choice.reason,
-        adapters: selection::adapters(),
+        adapters: match choice.adapters {
+            adapters if adapters.is_empty() => selection::adapters(),
+            adapters => adapters,
+        },
         speeds: Vec::new(),
         weights: None,
     };

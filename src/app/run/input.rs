@@ -56,7 +56,7 @@ pub fn require_file(key: &str, path: &Path) -> Result<()> {
     let is_default = key == "map_file" && path == MapInputConfig::default().map_file;
     ensure!(
         !is_default || path.exists(),
-        "no map was given, and {} does not exist; give one by --map MAP (map_file)",
+        "{} does not exist, where a map is by default (map_file); build one, or give it by --map MAP",
         path.display()
     );
     let or_topic = match key {

@@ -194,11 +194,12 @@ impl Report {
 
     /// The same table in Markdown, with definitions.
     pub fn to_markdown(&self) -> String {
-        // Names from outside are no markup.
-        let mut text = self
-            .about_lines("- ")
-            .replace('&', "&amp;")
-            .replace('<', "&lt;");
+        let mut text = String::new();
+        for (name, value) in &self.about {
+            // Names from outside are no markup, in a span of code.
+            let value = visible_in_line(value).replace('`', "'");
+            text += &format!("- {name}: `{value}`\n");
+        }
         let [title, rule] = if self.is_refined() {
             [" refined |", "---:|"]
         } else {

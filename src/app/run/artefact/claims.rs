@@ -177,7 +177,7 @@ impl Claims {
         let mut states = BTreeMap::new();
         let text = String::from_utf8_lossy(&text);
         let whole = text.rsplit_once('\n').map_or("", |(whole, _cut)| whole);
-        for line in whole.lines() {
+        for line in whole.split('\n') {
             match line.split_once(' ') {
                 Some(("removed", name)) => drop(states.remove(name)),
                 Some((state, name)) => drop(states.insert(name.to_owned(), state.to_owned())),

@@ -32,7 +32,7 @@ pub struct Ros2Args {
     #[arg(long, value_name = "FRAME", default_value = "base_link")]
     pub base_frame: String,
 
-    /// Time after a scan for which its transform is sent, with the motion going on until then [s]: a consumer finds one for now.
+    /// Time after a scan for which its transform is sent, extrapolated by the motion, for consumers that ask for the present [s].
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = tolerance)]
     pub transform_tolerance: f64,
 

@@ -101,7 +101,7 @@ impl Watch {
     }
 
     /// Notes that a message has arrived.
-    fn heard(&mut self) {
+    fn note_arrival(&mut self) {
         (self.last, self.has_warned) = (Instant::now(), false);
     }
 
@@ -115,11 +115,11 @@ impl Watch {
         let mut others = node.topics_of(message_type);
         others.retain(|it| it != topic && !it.starts_with("/fpmcl/"));
         let found = if let Some(other) = of_others.first() {
-            format!("others send {other} there")
+            format!("its type is {other} elsewhere")
         } else if others.is_empty() {
-            "no topic of this type was found: check the domain, the interface, and that its sender runs".to_owned()
+            "no other topic of this type was found: check the domain, the interface, and that its sender runs".to_owned()
         } else {
-            format!("topics of this type are {}", others.join(", "))
+            format!("other topics of this type are {}", others.join(", "))
         };
         tracing::warn!(
             "no {message_type} has arrived on {topic} for {} s{consequence}; {found}",
@@ -216,7 +216,7 @@ impl Receiver {
                 number += 1;
             }
             if has_received {
-                self.cloud_watch.heard();
+                self.cloud_watch.note_arrival();
                 if let Some((_, watch)) = &mut self.odometry {
                     watch.check(node, ": the motion is that of the scans");
                 }
@@ -244,7 +244,7 @@ impl Receiver {
         if let Some((odometry, watch)) = &mut self.odometry {
             warned.receive("the odometry", odometry, read_odometry, |it| {
                 shared.odometry(it);
-                watch.heard();
+                watch.note_arrival();
             });
         }
         let propose = |(pose, deviations)| shared.propose(pose, deviations);
