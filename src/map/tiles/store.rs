@@ -65,7 +65,18 @@ struct Files {
     /// Memory above which tiles are dropped [bytes].
     kept_bytes: u64,
     /// The folder, locked so that no other process removes files from it.
-    _in_use: Option<File>,
+    _in_use: Option<InUse>,
+}
+
+/// A folder that is locked as one in use.
+#[derive(Debug)]
+struct InUse(File);
+
+impl Drop for InUse {
+    fn drop(&mut self) {
+        // Closing it is not enough: a process that is being started holds a copy of it for a moment.
+        let _ = self.0.unlock();
+    }
 }
 
 /// The tiles that are in memory or cannot be read, and those that were not needed yet.
@@ -267,7 +278,7 @@ impl TileStore {
     }
 
     /// The tiles of an index, none of them in memory.
-    fn over(folder: PathBuf, in_use: Option<File>, index: TileFileIndex, kept_bytes: u64) -> Self {
+    fn over(folder: PathBuf, in_use: Option<InUse>, index: TileFileIndex, kept_bytes: u64) -> Self {
         let numbers = index.tiles.iter().map(TileEntry::index).zip(0..).collect();
         let bounds: Vec<Aabb> = index.tiles.iter().map(TileEntry::bounds).collect();
         let mut triangles = 0_u32;
@@ -556,9 +567,9 @@ fn require_own_index(folder: &Path) -> io::Result<()> {
 }
 
 /// A folder of tiles, locked as one that is in use; `None` where there are no such locks.
-fn in_use(folder: &Path) -> Option<File> {
+fn in_use(folder: &Path) -> Option<InUse> {
     let opened = File::open(folder).ok()?;
-    opened.lock_shared().is_ok().then_some(opened)
+    opened.lock_shared().is_ok().then_some(InUse(opened))
 }
 
 /// Removes the tiles and panoramas with another stamp, unless a process may use them.
