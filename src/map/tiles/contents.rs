@@ -92,8 +92,13 @@ pub(crate) fn remove_unused(newest: &Path) -> io::Result<()> {
 
 /// Whether a process uses the tiles of a folder.
 pub(crate) fn is_in_use(folder: &Path) -> bool {
-    let opened = File::open(folder);
-    opened.is_ok_and(|it| matches!(it.try_lock(), Err(TryLockError::WouldBlock)))
+    let Ok(opened) = File::open(folder) else {
+        return false;
+    };
+    let is_in_use = matches!(opened.try_lock(), Err(TryLockError::WouldBlock));
+    // As for those in use: closing it is not enough.
+    let _ = opened.unlock();
+    is_in_use
 }
 
 /// Removes a cache; files of others, and their folder, stay.
