@@ -230,7 +230,7 @@ fn a_robot_that_is_carried_elsewhere_is_lost_without_a_pose_and_found_again() {
     // Frames 5 to 34 of the robot's clock were elsewhere: after half a second nothing is believed.
     let poses = positions(&received["/fpmcl/pose"]);
     let transforms = received["/tf"].as_array().unwrap().iter();
-    let transforms = transforms.flat_map(|it| positions(it));
+    let transforms = transforms.flat_map(positions);
     for (moment, position) in poses.iter().copied().chain(transforms) {
         assert!(!(10..35).contains(&moment), "{moment} {position:?}");
         // Then it drove to frame 11 and back to 5.
