@@ -17,7 +17,7 @@ pub enum MeshingError {
         needed: usize,
     },
     #[error(
-        "the points extend over {extent_m:.0} m, so that the finest octree cells would be {cell_m:.2} m wide at depth {depth}, more than {limit_m} m; raise the depth, of at most 12, or mesh fewer points at a time, or check their poses"
+        "the points extend over {extent_m:.0} m, so that the finest octree cells would be {cell_m:.2} m wide, more than {limit_m} m; raise depth, which is {depth}, at most to 12, or mesh fewer points at a time, or check their poses"
     )]
     CellsTooLarge {
         extent_m: f32,
