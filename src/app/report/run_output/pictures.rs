@@ -131,6 +131,12 @@ impl<'a> Drawing<'a> {
         }
     }
 
+    /// Frames of which the estimate of the filter is trusted, and not only a pose that was filled back.
+    fn tracked(&self) -> Vec<bool> {
+        let tracked = self.results.tracked();
+        tracked.unwrap_or_else(|| self.results.trusted())
+    }
+
     /// Saves a chart in `plots/`, or removes that of an earlier run if it shows nothing.
     fn save(&self, chart: &LineChart, name: &str) -> Result<()> {
         if chart.panels.is_empty() {
@@ -197,7 +203,7 @@ impl<'a> Drawing<'a> {
         let (x_name, x) = time_axis(self.results);
         let refined = self.results.refined.as_deref();
         let refined = refined.map(|poses| with_gaps(poses, &self.results.refined_trusted()));
-        let estimates = with_gaps(&self.estimates, &self.results.trusted());
+        let estimates = with_gaps(&self.estimates, &self.tracked());
         let found = [
             (self.name, MCL, estimates),
             ("refined", REFINED, refined.unwrap_or_default()),
@@ -256,7 +262,7 @@ impl<'a> Drawing<'a> {
             self.results.estimates_in_space.as_deref(),
             self.results.refined_in_space.as_deref(),
         );
-        let [of_filter, of_refined] = [self.results.trusted(), self.results.refined_trusted()];
+        let [of_filter, of_refined] = [self.tracked(), self.results.refined_trusted()];
         let trajectories = [
             (
                 self.name,
