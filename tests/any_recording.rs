@@ -375,6 +375,10 @@ fn a_sensor_of_another_kind_is_found_anywhere_at_two_scans_a_second() {
     let report = localize_odd_frames(folder.path(), &data, &truth);
     // A single scan confirms its place only if nearly all of its beams agree: by the seed, that is the first or the second.
     assert!(report["summary"]["tracking"].as_u64() >= Some(15));
+    // In the second case the first frame is filled back.
+    let trajectory = fs::read_to_string(folder.path().join("r/mcl_tum.txt")).unwrap();
+    let poses = trajectory.lines().filter(|line| !line.starts_with('#'));
+    assert_eq!(poses.count(), 16);
     let position = &report["mcl"]["metrics"]["position_m"];
     assert!(position["rmse"].as_f64().unwrap() < 0.05, "{position}");
     assert!(position["max"].as_f64().unwrap() < 0.5, "{position}");

@@ -34,6 +34,11 @@ const LOCALIZE: &[&str] = &["localize", "localization.yml", "--backend=cpu"];
 
 const REFINE: &[&str] = &["refine", "refinement.yml", "--backend=cpu"];
 
+/// Signals of terminals, of service managers and batch systems, and of limits of time.
+const SIGNALS: [&str; 9] = [
+    "-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-ALRM", "-XCPU", "-VTALRM", "-PROF",
+];
+
 /// A scan as a named pipe.
 struct PipedScan {
     path: PathBuf,
@@ -73,6 +78,16 @@ impl PipedScan {
 fn start(recording: &Recording, arguments: &[&str]) -> Child {
     let program = assert_cmd::cargo::cargo_bin!("fpmcl");
     start_by(Command::new(program), recording, arguments)
+}
+
+/// Starts the program in a shell that has run a script before.
+fn start_after(script: &str, recording: &Recording, arguments: &[&str]) -> Child {
+    let mut shell = Command::new("sh");
+    shell
+        .arg("-c")
+        .arg(format!("{script}; exec \"$0\" \"$@\""))
+        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
+    start_by(shell, recording, arguments)
 }
 
 /// Starts the program by a command that takes its arguments.
@@ -400,8 +415,7 @@ fn a_busy_localization_ends_in_time_and_keeps_its_finished_frames() {
     let recording = Recording::street(12);
     recording.fpmcl("build-map").succeeds();
     let scan = PipedScan::new(&recording, 7);
-    // Those of terminals, of service managers and batch systems, and of limits of time.
-    for signal in ["-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-PROF", "-XCPU"] {
+    for signal in SIGNALS {
         let forced = [LOCALIZE, &["--force"]].concat();
         let stderr = overdue(signal, &recording, &forced, &scan);
         let kept = "interrupted; 7 of 12 frames are localized and kept in results/";
@@ -423,7 +437,7 @@ fn a_drive_that_is_interrupted_keeps_its_frames_also_while_no_scan_arrives() {
         &["--replay=velodyne", "--rate=1000", "--queue=100"],
     ]
     .concat();
-    for signal in ["-INT", "-TERM"] {
+    for signal in SIGNALS {
         let opened = scan.opened();
         let mut child = start(&recording, &live);
         let _pipe = wait(&opened, &mut child);
@@ -447,13 +461,9 @@ fn a_signal_ends_a_command_whose_messages_nobody_reads() {
     recording.fpmcl("build-map").succeeds();
     let scan = PipedScan::new(&recording, 3);
     let opened = scan.opened();
-    let mut shell = Command::new("sh");
     // As many bytes as fit into the pipe.
-    let full = "head -c 65536 /dev/zero >&2; exec \"$0\" \"$@\"";
-    shell
-        .args(["-c", full])
-        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
-    let mut child = start_by(shell, &recording, &[LOCALIZE, &["--quiet"]].concat());
+    let full = "head -c 65536 /dev/zero >&2";
+    let mut child = start_after(full, &recording, &[LOCALIZE, &["--quiet"]].concat());
     let _pipe = wait(&opened, &mut child);
     stopped_in_time("-TERM", child);
     let results = LocalizationResults::read(&recording.path("results/localization.npz"));
@@ -464,11 +474,7 @@ fn a_signal_ends_a_command_whose_messages_nobody_reads() {
 fn a_file_beyond_the_limit_of_the_shell_is_an_error_of_one_line() {
     let recording = Recording::street(6);
     recording.fpmcl("build-map").succeeds();
-    let mut shell = Command::new("sh");
-    shell
-        .args(["-c", "ulimit -f 8; exec \"$0\" \"$@\""])
-        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
-    let mut child = start_by(shell, &recording, LOCALIZE);
+    let mut child = start_after("ulimit -f 8", &recording, LOCALIZE);
     let stderr = read_until(&mut stderr_of(&mut child), None);
     assert_eq!(child.wait().unwrap().code(), Some(1), "{stderr}");
     assert!(stderr.contains("File too large"), "{stderr}");
@@ -516,11 +522,7 @@ fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
     let scan = PipedScan::new(&recording, 3);
     let opened = scan.opened();
     // As `nohup` does.
-    let mut shell = Command::new("sh");
-    shell
-        .args(["-c", "trap '' HUP; exec \"$0\" \"$@\""])
-        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
-    let mut child = start_by(shell, &recording, LOCALIZE);
+    let mut child = start_after("trap '' HUP", &recording, LOCALIZE);
     let pipe = wait(&opened, &mut child);
     send("-HUP", &child);
     let reader = stderr_of(&mut child);
