@@ -80,6 +80,17 @@ impl AtomicFile {
     }
 }
 
+/// An open file that is unlocked when it is dropped. Closing it is not enough: a process that is being started holds a copy of it
+/// for a moment.
+#[derive(Debug)]
+pub struct UnlockedOnDrop(pub File);
+
+impl Drop for UnlockedOnDrop {
+    fn drop(&mut self) {
+        let _ = self.0.unlock();
+    }
+}
+
 /// Remembers which folder a path is now; [`check_claimed`] compares.
 pub fn claim_folder(folder: &Path) -> io::Result<()> {
     let found = identity(folder)?;
@@ -128,12 +139,12 @@ fn identity(folder: &Path) -> io::Result<Identity> {
 }
 
 /// Requires that a file of this program can be written at a path: there is none, or one that is empty or begins with
-/// `magic`. A link, or a file of another program, is an error.
-pub fn require_own(path: &Path, magic: [u8; 8]) -> io::Result<()> {
+/// `magic`, which is `None` for files that are always empty. A link, or a file of another program, is an error.
+pub fn require_own(path: &Path, magic: Option<[u8; 8]>) -> io::Result<()> {
     let begins_with_magic = || {
         let mut begin = [0; 8];
         let read = File::open(path).and_then(|mut file| file.read_exact(&mut begin));
-        read.is_ok() && begin == magic
+        read.is_ok() && Some(begin) == magic
     };
     match fs::symlink_metadata(path) {
         Ok(found) if found.is_file() && (found.len() == 0 || begins_with_magic()) => Ok(()),
@@ -146,9 +157,9 @@ pub fn require_own(path: &Path, magic: [u8; 8]) -> io::Result<()> {
     }
 }
 
-/// Requires that a folder is not a link to one elsewhere.
-pub fn require_no_link(folder: &Path) -> io::Result<()> {
-    if fs::symlink_metadata(folder).is_ok_and(|found| found.is_symlink()) {
+/// Requires that a file or folder is not a link to one elsewhere.
+pub fn require_no_link(path: &Path) -> io::Result<()> {
+    if fs::symlink_metadata(path).is_ok_and(|found| found.is_symlink()) {
         return Err(io::Error::other("it is a link; remove it"));
     }
     Ok(())

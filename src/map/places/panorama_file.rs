@@ -141,7 +141,7 @@ impl Panoramas {
         // What cannot be removed is reported when the file cannot be written.
         let _ = remove_abandoned(path);
         let write = || {
-            require_own(path, MAGIC)?;
+            require_own(path, Some(MAGIC))?;
             let described = write_atomically(path, |out| {
                 let mut hasher = crc32fast::Hasher::new();
                 let mut write = |out: &mut dyn Write, part: &[u8]| -> io::Result<()> {

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use super::file::{ENDING, INDEX, INDEX_MAGIC, TILE_MAGIC};
-use crate::files::{require_no_link, require_own};
+use crate::files::{UnlockedOnDrop, require_no_link, require_own};
 use crate::map::places::panorama_file::MAGIC as PANORAMA_MAGIC;
 
 /// Ending of the names of files of panoramas.
@@ -56,7 +56,8 @@ pub(crate) fn files_of(folder: &Path) -> io::Result<Vec<CacheFile>> {
             _ => continue,
         };
         // Another process may have removed it by now.
-        if let (Ok(()), Ok(found)) = (require_own(&path, magic), fs::symlink_metadata(&path)) {
+        if let (Ok(()), Ok(found)) = (require_own(&path, Some(magic)), fs::symlink_metadata(&path))
+        {
             files.push(CacheFile {
                 bytes: found.len(),
                 used: found.modified()?,
@@ -92,13 +93,8 @@ pub(crate) fn remove_unused(newest: &Path) -> io::Result<()> {
 
 /// Whether a process uses the tiles of a folder.
 pub(crate) fn is_in_use(folder: &Path) -> bool {
-    let Ok(opened) = File::open(folder) else {
-        return false;
-    };
-    let is_in_use = matches!(opened.try_lock(), Err(TryLockError::WouldBlock));
-    // As for those in use: closing it is not enough.
-    let _ = opened.unlock();
-    is_in_use
+    let opened = File::open(folder).map(UnlockedOnDrop);
+    opened.is_ok_and(|it| matches!(it.0.try_lock(), Err(TryLockError::WouldBlock)))
 }
 
 /// Removes a cache; files of others, and their folder, stay.

@@ -19,7 +19,9 @@ use super::file::{
     self, INDEX, INDEX_MAGIC, Source, TILE_MAGIC, TileEntry, TileFile, TileFileIndex, TileScene,
 };
 use super::grid::{TileIndex, triangles_of_tiles};
-use crate::files::{remove_abandoned, require_no_link, require_own, write_atomically};
+use crate::files::{
+    UnlockedOnDrop, remove_abandoned, require_no_link, require_own, write_atomically,
+};
 use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
 use crate::map::build::plan::origin_near;
@@ -65,18 +67,7 @@ struct Files {
     /// Memory above which tiles are dropped [bytes].
     kept_bytes: u64,
     /// The folder, locked so that no other process removes files from it.
-    _in_use: Option<InUse>,
-}
-
-/// A folder that is locked as one in use.
-#[derive(Debug)]
-struct InUse(File);
-
-impl Drop for InUse {
-    fn drop(&mut self) {
-        // Closing it is not enough: a process that is being started holds a copy of it for a moment.
-        let _ = self.0.unlock();
-    }
+    _in_use: Option<UnlockedOnDrop>,
 }
 
 /// The tiles that are in memory or cannot be read, and those that were not needed yet.
@@ -258,7 +249,7 @@ impl TileStore {
             }
             let entry = TileEntry::new(*tile, bounds, triangles.len());
             let file = entry.file(folder, stamp);
-            require_own(&file, TILE_MAGIC)?;
+            require_own(&file, Some(TILE_MAGIC))?;
             write_atomically(&file, |out| out.write_all(&bytes))?;
             tiles.push(entry);
         }
@@ -278,7 +269,12 @@ impl TileStore {
     }
 
     /// The tiles of an index, none of them in memory.
-    fn over(folder: PathBuf, in_use: Option<InUse>, index: TileFileIndex, kept_bytes: u64) -> Self {
+    fn over(
+        folder: PathBuf,
+        in_use: Option<UnlockedOnDrop>,
+        index: TileFileIndex,
+        kept_bytes: u64,
+    ) -> Self {
         let numbers = index.tiles.iter().map(TileEntry::index).zip(0..).collect();
         let bounds: Vec<Aabb> = index.tiles.iter().map(TileEntry::bounds).collect();
         let mut triangles = 0_u32;
@@ -563,13 +559,16 @@ fn checksum_of(path: &Path) -> io::Result<u32> {
 /// Requires that a folder of tiles is no link and has no index that others wrote.
 fn require_own_index(folder: &Path) -> io::Result<()> {
     require_no_link(folder)?;
-    require_own(&folder.join(INDEX), INDEX_MAGIC)
+    require_own(&folder.join(INDEX), Some(INDEX_MAGIC))
 }
 
 /// A folder of tiles, locked as one that is in use; `None` where there are no such locks.
-fn in_use(folder: &Path) -> Option<InUse> {
+fn in_use(folder: &Path) -> Option<UnlockedOnDrop> {
     let opened = File::open(folder).ok()?;
-    opened.lock_shared().is_ok().then_some(InUse(opened))
+    opened
+        .lock_shared()
+        .is_ok()
+        .then_some(UnlockedOnDrop(opened))
 }
 
 /// Removes the tiles and panoramas with another stamp, unless a process may use them.

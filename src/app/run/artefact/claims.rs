@@ -22,7 +22,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, bail, ensure};
 
 use crate::app::run::output;
-use crate::files::{check_claimed, claim_folder, folder_of, remove_abandoned, temporary_next_to};
+use crate::files::{
+    check_claimed, claim_folder, folder_of, remove_abandoned, require_no_link, temporary_next_to,
+};
 
 /// File of the claims in each folder.
 pub const CLAIMS_FILE: &str = ".fpmcl";
@@ -247,13 +249,8 @@ impl Claims {
             return Ok(());
         }
         let path = self.folder.join(CLAIMS_FILE);
-        let is_link = fs::symlink_metadata(&path).is_ok_and(|found| found.is_symlink());
-        ensure!(
-            !is_link,
-            "{} is a link, and is not followed; remove it",
-            path.display()
-        );
-        check_claimed(&path)
+        require_no_link(&path)
+            .and_then(|()| check_claimed(&path))
             .and_then(|()| append(&path, &lines))
             .with_context(|| format!("cannot write {}", path.display()))
     }

@@ -1,28 +1,24 @@
 //! Locks that a crash releases.
 
 use std::fs::{self, File, TryLockError};
+use std::io;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result};
+
+use crate::files::{UnlockedOnDrop, require_own};
 
 /// A locked file.
 pub struct Lock {
-    file: File,
+    file: UnlockedOnDrop,
     path: PathBuf,
-}
-
-impl Drop for Lock {
-    fn drop(&mut self) {
-        // Closing the file is not enough: a process that is being started holds a copy of it for a moment.
-        let _ = self.file.unlock();
-    }
 }
 
 impl Lock {
     /// Waits until the file can be locked by this process alone.
     pub fn wait(path: &Path) -> Result<Self> {
         let lock = Self::open(path)?;
-        lock.file.lock().with_context(|| cannot_lock(path))?;
+        lock.file.0.lock().with_context(|| cannot_lock(path))?;
         Ok(lock)
     }
 
@@ -30,9 +26,9 @@ impl Lock {
     pub fn now(path: &Path, is_shared: bool) -> Result<Option<Self>> {
         let lock = Self::open(path)?;
         let locked = if is_shared {
-            lock.file.try_lock_shared()
+            lock.file.0.try_lock_shared()
         } else {
-            lock.file.try_lock()
+            lock.file.0.try_lock()
         };
         match locked {
             // Who has just ended removes the file, and another one may have made its own.
@@ -43,30 +39,27 @@ impl Lock {
     }
 
     fn open(path: &Path) -> Result<Self> {
-        let is_ours = || match fs::symlink_metadata(path) {
-            Ok(found) => found.is_file() && found.len() == 0,
-            Err(_missing) => true,
-        };
-        let own = || -> Result<File> {
-            ensure!(is_ours(), "it is no lock of fpmcl; move it");
+        let open = || {
+            require_own(path, None)?;
             let mut options = File::options();
             let file = options
                 .write(true)
                 .create(true)
                 .truncate(false)
                 .open(path)?;
-            ensure!(is_ours(), "it was replaced while it was opened");
-            Ok(file)
+            // It may have been replaced meanwhile.
+            require_own(path, None)?;
+            io::Result::Ok(file)
         };
         Ok(Self {
-            file: own().with_context(|| cannot_lock(path))?,
+            file: UnlockedOnDrop(open().with_context(|| cannot_lock(path))?),
             path: path.to_owned(),
         })
     }
 
     /// Whether the file is still the one of its path.
     pub fn is_in_place(&self) -> bool {
-        is_at(&self.file, &self.path)
+        is_at(&self.file.0, &self.path)
     }
 }
 
@@ -102,7 +95,7 @@ mod tests {
         let lock = Lock::now(&path, false).unwrap().unwrap();
         assert!(Lock::now(&path, true).unwrap().is_none());
         // As of a process that another thread is just starting.
-        let copy = lock.file.try_clone().unwrap();
+        let copy = lock.file.0.try_clone().unwrap();
         drop(lock);
         let [first, second] = [true, true].map(|is_shared| Lock::now(&path, is_shared).unwrap());
         assert!(first.is_some() && second.is_some());
