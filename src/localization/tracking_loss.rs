@@ -178,7 +178,7 @@ impl AgreementMonitor {
 
     /// Whether a share is so far below the usual one that the pose of its frame is not to be trusted, whatever the averages
     /// say: as where the motion into it was not what the odometry found.
-    pub fn is_odd(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
+    pub fn is_far_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
         let both = agreement.zip(self.slow);
         both.is_some_and(|(share, slow)| share < config.lost_fraction * slow)
     }
@@ -196,17 +196,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_share_far_below_the_usual_one_is_odd_and_a_first_one_is_not() {
+    fn a_share_far_below_the_usual_one_is_noticed_and_a_first_one_is_not() {
         let config = TrackingLossConfig::default();
         let mut monitor = AgreementMonitor::default();
-        assert!(!monitor.is_odd(Some(0.3), &config));
+        assert!(!monitor.is_far_below_usual(Some(0.3), &config));
         for _ in 0..5 {
             monitor.observe(Some(0.96), &config);
         }
         monitor.observe(Some(0.66), &config);
         // The averages see no loss yet.
-        assert!(!monitor.is_lost(&config) && monitor.is_odd(Some(0.66), &config));
-        assert!(!monitor.is_odd(Some(0.8), &config) && !monitor.is_odd(None, &config));
+        assert!(!monitor.is_lost(&config) && monitor.is_far_below_usual(Some(0.66), &config));
+        assert!(
+            !monitor.is_far_below_usual(Some(0.8), &config)
+                && !monitor.is_far_below_usual(None, &config)
+        );
     }
 
     fn after(agreements: &[f64]) -> bool {

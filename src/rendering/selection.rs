@@ -78,7 +78,7 @@ impl BackendChoice {
 pub fn choose(backend: Backend, method: RenderingMethod) -> Result<BackendChoice, RenderError> {
     let adapters = match backend {
         Backend::Cpu => Vec::new(),
-        // Drivers take time, and print errors of their own where there is no display.
+        // Loading drivers takes time, and those of Mesa print an error where there is no display.
         Backend::Auto if !may_have_graphics_card() => Vec::new(),
         Backend::Auto | Backend::Gpu => adapters(),
     };

@@ -44,8 +44,9 @@ impl ParticleFilter {
         let evidence = self.evidence(&estimate, odometry);
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
-        let is_odd = (self.agreement).is_odd(estimate.agreement, &self.config.tracking_loss);
-        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_odd;
+        let is_far_below_usual =
+            (self.agreement).is_far_below_usual(estimate.agreement, &self.config.tracking_loss);
+        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_far_below_usual;
         estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)

@@ -59,7 +59,7 @@ impl GroundConfidences {
             .map(|i| IVec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1))
             .collect();
         let mean = |(sum, count): (f32, f32)| (count > 0.0).then(|| sum / count);
-        let near = |(level, vertex): (usize, Vec3)| {
+        let near = |level: usize, vertex: Vec3| {
             let cells = &self.levels[level];
             let center = cell_of(vertex, self.cell_m) >> level as i32;
             let own = cells.get(&center).copied();
@@ -73,8 +73,8 @@ impl GroundConfidences {
         vertices
             .par_iter()
             .map(|&vertex| {
-                let mut levels = (0..self.levels.len()).map(|level| (level, vertex));
-                levels.find_map(near).unwrap_or(0.0)
+                let found = (0..self.levels.len()).find_map(|level| near(level, vertex));
+                found.unwrap_or(0.0)
             })
             .collect()
     }

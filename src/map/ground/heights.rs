@@ -139,8 +139,8 @@ impl GroundTriangles {
 
 impl ChunkSource for GroundTriangles {
     fn chunk(&self, chunk: Cell) -> Result<Option<SharedBytes>, TileError> {
-        /// Size of the place of a chunk without ground [bytes].
-        const PLACE_BYTES: usize = 64;
+        /// Size of an entry without ground [bytes].
+        const ENTRY_BYTES: usize = 64;
         let made = self.made.read().unwrap_or_else(PoisonError::into_inner);
         if let Some(made) = made.chunks.get(&chunk) {
             return Ok(made.clone());
@@ -151,7 +151,7 @@ impl ChunkSource for GroundTriangles {
         if all.bytes >= KEPT_BYTES {
             *all = MadeChunks::default();
         }
-        all.bytes += PLACE_BYTES + made.as_deref().map_or(0, <[u8]>::len);
+        all.bytes += ENTRY_BYTES + made.as_deref().map_or(0, <[u8]>::len);
         all.chunks.insert(chunk, made.clone());
         Ok(made)
     }

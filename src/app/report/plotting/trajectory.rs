@@ -184,10 +184,7 @@ pub fn drift_chart(truth: &[Pose3], trajectories: &[NamedPoses]) -> LineChart {
                 .filter(|(_, is_trusted)| **is_trusted);
             poses.map(|(pose, _)| *pose).collect()
         };
-        let (of_estimates, of_truth) = match estimates {
-            [] => (Vec::new(), Vec::new()),
-            estimates => (trusted_of(estimates), trusted_of(truth)),
-        };
+        let (of_estimates, of_truth) = (trusted_of(estimates), trusted_of(truth));
         let moved = rigid_alignment(&of_estimates, &of_truth).map(|it| aligned(&it, estimates));
         let label = format!("{name}, rigidly aligned");
         for (name, mark, poses) in [

@@ -135,7 +135,7 @@ impl Report {
         let width = width.unwrap_or(0);
         let mut text = format!("{}\n\n", self.verdict());
         if all && !self.about.is_empty() {
-            text += &(self.about_lines("") + "\n");
+            text += &(self.about_lines() + "\n");
         }
         let line = |name: &str, mcl: &str, refined: &str, unit: &str| {
             let line = format!("{name:width$}  {mcl:>10}  {refined:>10}  {unit}");
@@ -282,9 +282,9 @@ impl Report {
         .collect()
     }
 
-    fn about_lines(&self, prefix: &str) -> String {
+    fn about_lines(&self) -> String {
         (self.about.iter())
-            .map(|(name, value)| format!("{prefix}{name}: {}\n", visible_in_line(value)))
+            .map(|(name, value)| format!("{name}: {}\n", visible_in_line(value)))
             .collect()
     }
 }

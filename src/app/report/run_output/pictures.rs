@@ -131,6 +131,12 @@ impl<'a> Drawing<'a> {
         }
     }
 
+    /// The refined trajectory, with gaps where it is not trusted.
+    fn refined_with_gaps(&self) -> Option<Vec<Pose2>> {
+        let refined = self.results.refined.as_deref()?;
+        Some(with_gaps(refined, &self.results.refined_trusted()))
+    }
+
     /// Frames of which the estimate of the filter is trusted, and not only a pose that was filled back.
     fn tracked(&self) -> Vec<bool> {
         let tracked = self.results.tracked();
@@ -148,8 +154,7 @@ impl<'a> Drawing<'a> {
     /// Draws the best trajectory colored by its error, or without a truth by its standard deviation; gaps are gaps. No
     /// picture where nothing is trusted.
     fn path(&self) -> Result<()> {
-        let refined = self.results.refined.as_deref();
-        let refined = refined.map(|poses| with_gaps(poses, &self.results.refined_trusted()));
+        let refined = self.refined_with_gaps();
         let refined = refined.as_deref().map(|poses| ("refined", REFINED, poses));
         let mut paths = vec![(self.name, MCL, self.trajectory.as_slice())];
         paths.extend(refined);
@@ -201,8 +206,7 @@ impl<'a> Drawing<'a> {
     fn errors(&self) -> Result<()> {
         let truth = self.truth.filter(|_| !self.results.particles.is_empty());
         let (x_name, x) = time_axis(self.results);
-        let refined = self.results.refined.as_deref();
-        let refined = refined.map(|poses| with_gaps(poses, &self.results.refined_trusted()));
+        let refined = self.refined_with_gaps();
         let estimates = with_gaps(&self.estimates, &self.tracked());
         let found = [
             (self.name, MCL, estimates),

@@ -142,8 +142,7 @@ impl Node {
         let mut names: Vec<String> = of_type
             .filter_map(|it| Some(format!("/{}", it.topic_name().strip_prefix("rt/")?)))
             .collect();
-        names.sort();
-        names.dedup();
+        sort_unique(&mut names);
         names
     }
 
@@ -153,13 +152,9 @@ impl Node {
         let of_topic = topics
             .iter()
             .filter(|it| *it.topic_name() == wire_topic(topic));
-        let mut types: Vec<String> = of_topic
-            .map(|it| it.type_name().replace("::dds_::", "::").replace("::", "/"))
-            .map(|it| it.trim_end_matches('_').to_owned())
-            .filter(|it| it != message_type)
-            .collect();
-        types.sort();
-        types.dedup();
+        let types = of_topic.map(|it| type_of_wire(it.type_name()));
+        let mut types: Vec<String> = types.filter(|it| it != message_type).collect();
+        sort_unique(&mut types);
         types
     }
 
@@ -196,6 +191,17 @@ fn wire_type(message_type: &str) -> String {
         .split_once("/msg/")
         .unwrap_or(("", message_type));
     format!("{package}::msg::dds_::{name}_")
+}
+
+/// The inverse of [`wire_type`].
+fn type_of_wire(name: &str) -> String {
+    let name = name.replace("::dds_::", "::").replace("::", "/");
+    name.strip_suffix('_').unwrap_or(&name).to_owned()
+}
+
+fn sort_unique(names: &mut Vec<String>) {
+    names.sort();
+    names.dedup();
 }
 
 /// Receives messages of a topic, with the header of CDR.
@@ -318,5 +324,7 @@ mod tests {
             wire_type("tf2_msgs/msg/TFMessage"),
             "tf2_msgs::msg::dds_::TFMessage_"
         );
+        let known = "sensor_msgs/msg/PointCloud2";
+        assert_eq!(type_of_wire(&wire_type(known)), known);
     }
 }

@@ -35,8 +35,6 @@ const ODOMETRY: &str = "nav_msgs/msg/Odometry";
 
 /// The topics that are read.
 pub struct Receiver {
-    /// Name of the topic of the clouds.
-    topic: String,
     clouds: Reader,
     cloud_watch: Watch,
     odometry: Option<(Reader, Watch)>,
@@ -147,10 +145,8 @@ impl Receiver {
                 anyhow::Ok((reader(topic, ODOMETRY, Quality::BestEffort, 100)?, watch))
             })
             .transpose()?;
-        let topic = args.remapped(clouds);
         Ok(Self {
-            topic: topic.to_owned(),
-            cloud_watch: Watch::new(topic, CLOUD),
+            cloud_watch: Watch::new(args.remapped(clouds), CLOUD),
             clouds: reader(clouds, CLOUD, Quality::BestEffort, 5)?,
             odometry,
             transforms: reader("/tf", TRANSFORMS, Quality::BestEffort, 100)?,
@@ -210,7 +206,8 @@ impl Receiver {
                     }
                     Err(problem) => {
                         unreadable.fetch_add(1, Ordering::Relaxed);
-                        self.warned.warn_of_message(&self.topic, &problem);
+                        self.warned
+                            .warn_of_message(&self.cloud_watch.topic, &problem);
                     }
                 }
                 number += 1;
@@ -260,7 +257,7 @@ impl Receiver {
         if cloud.has_unknown_times && !std::mem::replace(&mut self.warned.of_times, true) {
             tracing::warn!(
                 "the times of the points of {} are ignored: in no unit do they last 10 ms to 1 s and agree with the stamp; correct the driver, or set motion_compensation",
-                self.topic
+                self.cloud_watch.topic
             );
         }
         let mut scan = cloud.scan;
