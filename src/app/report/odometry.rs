@@ -164,18 +164,22 @@ pub fn write(
 }
 
 /// The table of frames.
-fn frame_table(frames: &[Frame], poses: &[Pose3], steps: &[&OdometryEstimate]) -> FrameTable {
+fn frame_table<'a>(
+    frames: &'a [Frame],
+    poses: &'a [Pose3],
+    steps: &'a [&'a OdometryEstimate],
+) -> FrameTable<'a> {
     let mut table = FrameTable::empty(frames.len());
     table.add("frame", Some(frames), |it| it.number.to_string());
     table.add("time_s", Some(frames), |it| format!("{:.6}", it.time_s));
     for (axis, title) in ["x_m", "y_m", "z_m"].into_iter().enumerate() {
-        table.add(title, Some(poses), |it| {
+        table.add(title, Some(poses), move |it| {
             format!("{:.6}", it.translation.vector[axis])
         });
     }
     for (axis, title) in ["roll_rad", "pitch_rad", "yaw_rad"].into_iter().enumerate() {
-        let angle = |it: &Pose3| <[f64; 3]>::from(it.rotation.euler_angles())[axis];
-        table.add(title, Some(poses), |it| format!("{:.8}", angle(it)));
+        let angle = move |it: &Pose3| <[f64; 3]>::from(it.rotation.euler_angles())[axis];
+        table.add(title, Some(poses), move |it| format!("{:.8}", angle(it)));
     }
     let steps = Some(steps);
     table.add("state", steps, |it| in_words(it.state).to_owned());

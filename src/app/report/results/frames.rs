@@ -15,14 +15,13 @@ use crate::localization::State;
 
 /// Writes the table; of a trajectory without particles, that of its errors in space. Nothing without estimates.
 pub fn write_frames_csv(path: &Path, results: &LocalizationResults) -> Result<()> {
-    let table = match (&results.estimates, &results.estimates_in_space) {
+    match (&results.estimates, &results.estimates_in_space) {
         (_, Some(estimates)) if results.particles.is_empty() => {
-            FrameTable::of_trajectory(results, estimates)
+            write_trajectory(path, results, estimates)
         }
-        (Some(estimates), _) => FrameTable::new(results, estimates),
-        _ => return Ok(()),
-    };
-    table.save(path)
+        (Some(estimates), _) => write_localization(path, results, estimates),
+        _ => Ok(()),
+    }
 }
 
 /// A cost or an agreement, which are -1 in results where they are unknown, else not a number.
@@ -30,13 +29,110 @@ fn known(value: f64) -> f64 {
     if value < 0.0 { f64::NAN } else { value }
 }
 
-/// Columns with a title and one cell per frame.
-pub struct FrameTable {
-    rows: usize,
-    columns: Vec<(String, Vec<String>)>,
+/// Writes poses, errors and states of the filter and of the refinement.
+fn write_localization(
+    path: &Path,
+    results: &LocalizationResults,
+    estimates: &[Pose2],
+) -> Result<()> {
+    let truth = results.ground_truth.as_deref();
+    let refined = results.refined.as_deref();
+    let covariances = results.covariances.as_deref();
+    let errors = |poses: Option<&[Pose2]>| Some(planar_errors(poses?, truth?));
+    let (mcl_errors, refined_errors) = (errors(Some(estimates)), errors(refined));
+    let axes: Option<Vec<Axes>> = covariances.map(|covariances| {
+        let pairs = covariances.iter().zip(estimates);
+        pairs
+            .map(|(covariance, pose)| Axes::new(covariance, pose))
+            .collect()
+    });
+    let (trajectory, trusted) = (results.trajectory(estimates), results.trusted());
+    let driven_m = truth.map_or_else(|| trusted_distances_m(&trajectory, &trusted), distances_m);
+    let trajectory = with_gaps(&trajectory, &trusted);
+    let word = |&number: &u8| {
+        State::from_number(number).map_or_else(|| number.to_string(), |it| it.word().to_owned())
+    };
+    let particles: Vec<usize> = (0..results.particles.len())
+        .map(|row| results.particles.count(row))
+        .collect();
+    let particles = (!particles.is_empty()).then_some(&*particles);
+    let mut table = FrameTable::empty(results.len());
+    table.add("frame", Some(&results.frames), usize::to_string);
+    table.add_numbers("time_s", results.times_s.as_deref(), |time_s| *time_s);
+    table.add_numbers("distance_m", Some(&driven_m), |distance_m| *distance_m);
+    table.add_poses("truth", truth);
+    table.add_poses("mcl", Some(estimates));
+    table.add_errors("mcl", mcl_errors.as_deref());
+    table.add_deviations(covariances, axes.as_deref());
+    table.add_poses("refined", refined);
+    table.add_errors("refined", refined_errors.as_deref());
+    table.add("particles", particles, usize::to_string);
+    let agreements = results.agreements.as_deref();
+    table.add_numbers("agreement", agreements, |share| known(*share));
+    let places = results.places.as_deref();
+    table.add_numbers("places", places, |places| *places);
+    table.add("state", results.states.as_deref(), word);
+    table.add_poses("trajectory", Some(&trajectory));
+    table.add("refined_state", results.refined_states.as_deref(), word);
+    for (names, column) in [
+        (
+            ["cost_before_m", "cost_after_m"],
+            &results.refinement_costs_m,
+        ),
+        (
+            ["agreement_before", "agreement_after"],
+            &results.refinement_agreements,
+        ),
+    ] {
+        for (moment, name) in names.into_iter().enumerate() {
+            table.add_numbers(name, column.as_deref(), move |pair| known(pair[moment]));
+        }
+    }
+    for (name, runtimes_s) in [
+        ("runtime_ms", &results.runtimes_s),
+        ("refine_runtime_ms", &results.refine_runtimes_s),
+    ] {
+        table.add_numbers(name, runtimes_s.as_deref(), |time_s| 1e3 * time_s);
+    }
+    table.save(path)
 }
 
-impl FrameTable {
+/// Writes poses in space and their errors against the distance driven.
+fn write_trajectory(path: &Path, results: &LocalizationResults, estimates: &[Pose3]) -> Result<()> {
+    let truth = results.ground_truth_in_space.as_deref();
+    let errors = truth.map(|truth| drift(estimates, truth));
+    let errors = errors.as_deref();
+    let mut table = FrameTable::empty(results.len());
+    table.add("frame", Some(&results.frames), usize::to_string);
+    table.add_numbers("time_s", results.times_s.as_deref(), |time_s| *time_s);
+    table.add_numbers("distance_m", errors, |error| error.distance_m);
+    for (name, poses) in [("truth", truth), ("estimate", Some(estimates))] {
+        for (axis, letter) in ["x", "y", "z"].into_iter().enumerate() {
+            table.add_numbers(format!("{name}_{letter}_m"), poses, move |pose| {
+                pose.translation.vector[axis]
+            });
+        }
+    }
+    table.add_numbers("position_error_m", errors, |error| error.position_m);
+    table.add_numbers("heading_error_deg", errors, |error| {
+        error.heading_rad.to_degrees()
+    });
+    table.add_numbers("rotation_error_deg", errors, |error| {
+        error.rotation_rad.to_degrees()
+    });
+    table.save(path)
+}
+
+/// Columns with a title and one cell per frame, which are made when they are written.
+pub struct FrameTable<'a> {
+    rows: usize,
+    columns: Vec<(String, Cell<'a>)>,
+}
+
+/// The cell of a row.
+type Cell<'a> = Box<dyn Fn(usize) -> String + 'a>;
+
+impl<'a> FrameTable<'a> {
     /// A table of a number of rows without columns.
     pub fn empty(rows: usize) -> Self {
         Self {
@@ -45,116 +141,33 @@ impl FrameTable {
         }
     }
 
-    fn new(results: &LocalizationResults, estimates: &[Pose2]) -> Self {
-        let truth = results.ground_truth.as_deref();
-        let refined = results.refined.as_deref();
-        let (trajectory, trusted) = (results.trajectory(estimates), results.trusted());
-        let driven_m =
-            truth.map_or_else(|| trusted_distances_m(&trajectory, &trusted), distances_m);
-        let trajectory = with_gaps(&trajectory, &trusted);
-        let word = |&number: &u8| {
-            State::from_number(number).map_or_else(|| number.to_string(), |it| it.word().to_owned())
-        };
-        let particles: Vec<usize> = (0..results.particles.len())
-            .map(|row| results.particles.count(row))
-            .collect();
-        let particles = (!particles.is_empty()).then_some(particles);
-        let mut table = Self::empty(results.len());
-        table.add("frame", Some(&results.frames), usize::to_string);
-        table.add_numbers("time_s", results.times_s.as_deref(), |time_s| *time_s);
-        table.add_numbers("distance_m", Some(&driven_m), |distance_m| *distance_m);
-        table.add_poses("truth", truth);
-        table.add_poses("mcl", Some(estimates));
-        table.add_errors("mcl", Some(estimates), truth);
-        table.add_deviations(results.covariances.as_deref(), estimates);
-        table.add_poses("refined", refined);
-        table.add_errors("refined", refined, truth);
-        table.add("particles", particles.as_deref(), usize::to_string);
-        let agreements = results.agreements.as_deref();
-        table.add_numbers("agreement", agreements, |share| known(*share));
-        let places = results.places.as_deref();
-        table.add_numbers("places", places, |places| *places);
-        table.add("state", results.states.as_deref(), word);
-        table.add_poses("trajectory", Some(&trajectory));
-        table.add("refined_state", results.refined_states.as_deref(), word);
-        for (names, column) in [
-            (
-                ["cost_before_m", "cost_after_m"],
-                &results.refinement_costs_m,
-            ),
-            (
-                ["agreement_before", "agreement_after"],
-                &results.refinement_agreements,
-            ),
-        ] {
-            for (moment, name) in names.into_iter().enumerate() {
-                table.add_numbers(name, column.as_deref(), |pair| known(pair[moment]));
-            }
-        }
-        table.add_numbers("runtime_ms", results.runtimes_s.as_deref(), |time_s| {
-            1e3 * time_s
-        });
-        table.add_numbers(
-            "refine_runtime_ms",
-            results.refine_runtimes_s.as_deref(),
-            |time_s| 1e3 * time_s,
-        );
-        table
-    }
-
-    /// Poses in space and their errors against the distance driven.
-    fn of_trajectory(results: &LocalizationResults, estimates: &[Pose3]) -> Self {
-        let truth = results.ground_truth_in_space.as_deref();
-        let errors = truth.map(|truth| drift(estimates, truth));
-        let errors = errors.as_deref();
-        let mut table = Self::empty(results.len());
-        table.add("frame", Some(&results.frames), usize::to_string);
-        table.add_numbers("time_s", results.times_s.as_deref(), |time_s| *time_s);
-        table.add_numbers("distance_m", errors, |error| error.distance_m);
-        for (name, poses) in [("truth", truth), ("estimate", Some(estimates))] {
-            for (axis, letter) in ["x", "y", "z"].into_iter().enumerate() {
-                table.add_numbers(format!("{name}_{letter}_m"), poses, |pose| {
-                    pose.translation.vector[axis]
-                });
-            }
-        }
-        table.add_numbers("position_error_m", errors, |error| error.position_m);
-        table.add_numbers("heading_error_deg", errors, |error| {
-            error.heading_rad.to_degrees()
-        });
-        table.add_numbers("rotation_error_deg", errors, |error| {
-            error.rotation_rad.to_degrees()
-        });
-        table
-    }
-
     /// Adds a column with a cell per item, or with empty cells.
     pub fn add<T>(
         &mut self,
         title: impl Into<String>,
-        items: Option<&[T]>,
-        cell: impl Fn(&T) -> String,
+        items: Option<&'a [T]>,
+        cell: impl Fn(&T) -> String + 'a,
     ) {
-        let cells = match items {
-            Some(items) => items.iter().map(cell).collect(),
-            None => vec![String::new(); self.rows],
+        let cell: Cell = match items {
+            Some(items) => Box::new(move |row| cell(&items[row])),
+            None => Box::new(|_| String::new()),
         };
-        self.columns.push((title.into(), cells));
+        self.columns.push((title.into(), cell));
     }
 
     fn add_numbers<T>(
         &mut self,
         title: impl Into<String>,
-        items: Option<&[T]>,
-        number: impl Fn(&T) -> f64,
+        items: Option<&'a [T]>,
+        number: impl Fn(&T) -> f64 + 'a,
     ) {
-        self.add(title, items, |item| match number(item) {
+        self.add(title, items, move |item| match number(item) {
             number if number.is_nan() => String::new(),
             number => format!("{number:.4}"),
         });
     }
 
-    fn add_poses(&mut self, name: &str, poses: Option<&[Pose2]>) {
+    fn add_poses(&mut self, name: &str, poses: Option<&'a [Pose2]>) {
         self.add_numbers(format!("{name}_x_m"), poses, |pose| pose.translation.x);
         self.add_numbers(format!("{name}_y_m"), poses, |pose| pose.translation.y);
         self.add_numbers(format!("{name}_heading_deg"), poses, |pose| {
@@ -162,11 +175,7 @@ impl FrameTable {
         });
     }
 
-    fn add_errors(&mut self, name: &str, poses: Option<&[Pose2]>, truth: Option<&[Pose2]>) {
-        let errors = poses
-            .zip(truth)
-            .map(|(poses, truth)| planar_errors(poses, truth));
-        let errors = errors.as_deref();
+    fn add_errors(&mut self, name: &str, errors: Option<&'a [PlanarError]>) {
         self.add_numbers(
             format!("{name}_position_error_m"),
             errors,
@@ -180,14 +189,11 @@ impl FrameTable {
     }
 
     /// Adds the axes of the covariance of the position: a long one is a direction that the scene does not constrain.
-    fn add_deviations(&mut self, covariances: Option<&[Matrix3<f64>]>, estimates: &[Pose2]) {
-        let axes: Option<Vec<Axes>> = covariances.map(|covariances| {
-            let pairs = covariances.iter().zip(estimates);
-            pairs
-                .map(|(covariance, pose)| Axes::new(covariance, pose))
-                .collect()
-        });
-        let axes = axes.as_deref();
+    fn add_deviations(
+        &mut self,
+        covariances: Option<&'a [Matrix3<f64>]>,
+        axes: Option<&'a [Axes]>,
+    ) {
         self.add_numbers("mcl_sigma_long_m", axes, |axes| axes.long_m);
         self.add_numbers("mcl_sigma_short_m", axes, |axes| axes.short_m);
         self.add_numbers("mcl_long_axis_from_forward_deg", axes, |axes| {
@@ -204,7 +210,7 @@ impl FrameTable {
             let mut writer = csv::Writer::from_writer(file);
             writer.write_record(self.columns.iter().map(|(title, _)| title))?;
             for row in 0..self.rows {
-                writer.write_record(self.columns.iter().map(|(_, cells)| &cells[row]))?;
+                writer.write_record(self.columns.iter().map(|(_, cell)| cell(row)))?;
             }
             writer.flush()
         })
