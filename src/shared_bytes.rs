@@ -1,14 +1,14 @@
-//! Bytes that are shared: of a buffer, or of a file that is mapped into memory.
+//! Bytes of files that are mapped into memory: shared ones, of a file or a buffer, and those that are appended to.
 
 use std::fmt;
 use std::fs::File;
-use std::io::{self, Write};
-use std::ops::{Deref, Range};
+use std::io::{self, Read as _, Seek as _, SeekFrom, Write};
+use std::ops::{Deref, DerefMut, Range};
 use std::path::Path;
 use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
-use memmap2::Mmap;
+use memmap2::{Mmap, MmapMut};
 
 /// A multiple of it is where the bytes begin: a line of the cache.
 pub const ALIGNMENT: usize = 64;
@@ -107,6 +107,67 @@ impl fmt::Debug for SharedBytes {
     }
 }
 
+/// Bytes that are appended to an unnamed file: they take no memory that the system could not have back.
+#[derive(Debug)]
+pub struct GrowingBytes {
+    file: File,
+    map: MmapMut,
+    len: usize,
+}
+
+impl GrowingBytes {
+    /// Most bytes that are reserved at a time.
+    const LARGEST_STEP: usize = 1 << 22;
+
+    /// Bytes whose file is in a folder, or if none can be made there, among temporary files.
+    pub fn in_folder(folder: Option<&Path>, bytes: &[u8]) -> io::Result<Self> {
+        let file = unnamed_file(folder)?;
+        let map = MmapMut::map_anon(1)?;
+        let mut all = Self { file, map, len: 0 };
+        all.extend(bytes)?;
+        Ok(all)
+    }
+
+    /// Appends bytes; an error where the disk is full.
+    pub fn extend(&mut self, bytes: &[u8]) -> io::Result<()> {
+        let len = self.len + bytes.len();
+        let reserved = self.file.metadata()?.len() as usize;
+        if len > reserved {
+            // Written, not only claimed: a page that a full disk cannot hold would end the process when it is touched.
+            let step = len.clamp(1 << 16, Self::LARGEST_STEP).max(len - reserved);
+            self.file.seek(SeekFrom::Start(reserved as u64))?;
+            io::copy(&mut io::repeat(0).take(step as u64), &mut &self.file)?;
+            #[expect(unsafe_code, reason = "another program could change the file")]
+            // SAFETY: the file has no name, and no other handle.
+            let map = unsafe { MmapMut::map_mut(&self.file) }?;
+            self.map = map;
+        }
+        self.map[self.len..len].copy_from_slice(bytes);
+        self.len = len;
+        Ok(())
+    }
+}
+
+impl Deref for GrowingBytes {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.map[..self.len]
+    }
+}
+
+impl DerefMut for GrowingBytes {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        &mut self.map[..self.len]
+    }
+}
+
+/// A file without a name in a folder, or if none can be made there, among temporary files.
+pub fn unnamed_file(folder: Option<&Path>) -> io::Result<File> {
+    let in_folder = folder.and_then(|folder| tempfile::tempfile_in(folder).ok());
+    in_folder.map_or_else(tempfile::tempfile, Ok)
+}
+
 /// Where parts of some sizes are that follow each other, each beginning at a multiple of [`ALIGNMENT`]; `None` if they are
 /// longer than any file.
 pub fn ranges_of<const N: usize>(sizes: [u64; N]) -> Option<[Range<usize>; N]> {
@@ -164,6 +225,21 @@ mod tests {
             assert!(shared.part(63..100).is_none());
             assert!(shared.part(64..201).is_none());
             assert!(part.part(0..127).is_none());
+        }
+    }
+
+    #[test]
+    fn bytes_that_are_appended_stay_where_they_are_while_their_file_grows() {
+        let folder = tempfile::tempdir().unwrap();
+        let block: Vec<u8> = (0..=255).cycle().take(100_003).collect();
+        for folder in [None, Some(folder.path()), Some(Path::new("no such folder"))] {
+            let mut bytes = GrowingBytes::in_folder(folder, &block).unwrap();
+            (1..60).for_each(|_| bytes.extend(&block).unwrap());
+            bytes[7] = 99;
+            assert_eq!(bytes.len(), 60 * block.len());
+            assert_eq!(bytes[7], 99);
+            bytes[7] = 7;
+            assert!(bytes.chunks(block.len()).all(|chunk| chunk == block));
         }
     }
 

@@ -441,14 +441,14 @@ fn check_results(results: &LocalizationResults) {
     );
 }
 
-fn poses_of(results: &LocalizationResults) -> [Option<&Vec<Pose2>>; 4] {
+fn poses_of(results: &LocalizationResults) -> [Option<&[Pose2]>; 4] {
     [
         &results.estimates,
         &results.refined,
         &results.ground_truth,
         &results.odometry,
     ]
-    .map(Option::as_ref)
+    .map(Option::as_deref)
 }
 
 /// Checks that results agree; poses up to the rounding of their headings.

@@ -135,7 +135,7 @@ fn the_report_has_small_errors(results: &Path) {
 
 fn the_result_has_a_row_per_frame(results: &Path) {
     let result = LocalizationResults::read(&results.join("localization.npz")).unwrap();
-    assert_eq!(result.frames, (0..FRAMES).collect::<Vec<_>>());
+    assert_eq!(result.frames, (0..FRAMES).collect::<Vec<_>>().into());
     assert_eq!(result.refined.unwrap().len(), FRAMES);
     let table = fs::read_to_string(results.join("frames.csv")).unwrap();
     assert_eq!(table.lines().count(), 1 + FRAMES);

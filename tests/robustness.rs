@@ -143,7 +143,7 @@ fn frames_before_the_first_one_that_is_found_are_filled_back() {
     let states = result.states.unwrap();
     assert_ne!(states[0], State::Tracking as u8);
     assert_eq!(
-        result.trajectory_states.unwrap(),
+        *result.trajectory_states.unwrap(),
         [State::Tracking as u8; FRAMES]
     );
 }

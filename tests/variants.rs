@@ -143,7 +143,7 @@ impl World {
             ],
         );
         plain.unwrap();
-        world.truth = world.results().ground_truth_in_space.unwrap();
+        world.truth = world.results().ground_truth_in_space.unwrap().to_vec();
         world
     }
 

@@ -120,22 +120,26 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let truth: Option<Vec<Pose3>> = truth.collect();
     let planar = |truth: &[Pose3]| truth.iter().map(pose2_from_pose3).collect();
     results.ground_truth = (results.ground_truth.take()).or(truth.as_deref().map(planar));
-    results.ground_truth_in_space = results.ground_truth_in_space.take().or(truth);
+    results.ground_truth_in_space = results
+        .ground_truth_in_space
+        .take()
+        .or(truth.map(Into::into));
     let changes = refined.changes.iter();
-    let (costs_m, agreements) = changes.map(|&it| run_output::before_and_after(it)).unzip();
-    results.refinement_costs_m = Some(costs_m);
-    results.refinement_agreements = Some(agreements);
+    let changes = changes.map(|&it| run_output::before_and_after(it));
+    let (costs_m, agreements): (Vec<_>, Vec<_>) = changes.unzip();
+    results.refinement_costs_m = Some(costs_m.into());
+    results.refinement_agreements = Some(agreements.into());
     let states = refined.states.iter().map(|state| *state as u8);
     results.refined_states = Some(states.collect());
     if is_trajectory {
         warn_of_distance(config, &estimates, &refined);
         results.states.clone_from(&results.refined_states);
     }
-    results.estimates = Some(estimates);
-    results.refined = Some(refined.poses.clone());
-    results.refined_in_space = Some(refined.map_from_lidar.clone());
-    results.refined_covariances = Some(refined.covariances.clone());
-    results.refine_runtimes_s = Some(runtimes_s);
+    results.estimates = Some(estimates.into());
+    results.refined = Some(refined.poses.clone().into());
+    results.refined_in_space = Some(refined.map_from_lidar.clone().into());
+    results.refined_covariances = Some(refined.covariances.clone().into());
+    results.refine_runtimes_s = Some(runtimes_s.into());
     claims.begin(&main)?;
     let report = write_run(config, context, &files, &map, &sequence, &results)?;
     claims.finish(&main)?;

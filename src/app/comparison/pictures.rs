@@ -191,8 +191,8 @@ fn read_trajectory(record: &RunRecord, color: Rgb, layout: &Layout) -> Option<Tr
                 &results.trusted(),
             ),
         },
-        poses: results.refined.or(results.estimates)?,
-        truth: results.ground_truth?,
+        poses: results.refined.or(results.estimates)?.to_vec(),
+        truth: results.ground_truth?.to_vec(),
     })
 }
 

@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 
 use crate::app::report::results::{
-    LocalizationResults, RefinementSummary, Report, RunSummary, TrajectoryReport, write_frames_csv,
-    write_poses_npy,
+    Column, LocalizationResults, RefinementSummary, Report, RunSummary, TrajectoryReport,
+    write_frames_csv, write_poses_npy,
 };
 use crate::app::run::{Claims, Outputs, output};
 use crate::app::settings::{MapInputConfig, RecordingConfig};
@@ -147,8 +147,8 @@ impl<'a> Trajectory<'a> {
     pub fn of_filter(results: &'a LocalizationResults, frames: &'a [Frame]) -> Self {
         Self {
             frames,
-            poses: results.trajectory_in_space().map_or(&[], Vec::as_slice),
-            states: results.trajectory_states().map(Vec::as_slice),
+            poses: results.trajectory_in_space().map_or(&[], |poses| poses),
+            states: results.trajectory_states().map(|states| &**states),
         }
     }
 
@@ -299,7 +299,7 @@ pub fn evaluate(
 ) -> Result<Report> {
     let estimates = results.estimates_or_particle_means(rules)?;
     let truth_in_space = results.ground_truth_in_space.as_deref();
-    let report = |trajectory: &EvaluatedTrajectory, in_space: &Option<Vec<Pose3>>| {
+    let report = |trajectory: &EvaluatedTrajectory, in_space: &Option<Column<Pose3>>| {
         let in_space = in_space.as_deref().zip(truth_in_space);
         if trajectory.trusted_after(skipped(trajectory)).is_empty() {
             return Ok(None);

@@ -112,7 +112,7 @@ fn in_map(
         converge_thres: config.converge_thres,
         particle_select_ratio: config.particle_select_ratio,
     };
-    results.estimates = Some(results.estimates_or_particle_means(&rules)?);
+    results.estimates = Some(results.estimates_or_particle_means(&rules)?.into());
     let alignment = config.alignment.unwrap_or(Alignment::None);
     note(&mut about, alignment);
     truth::align(&mut results, alignment)?;

@@ -19,8 +19,8 @@ pub fn read(path: &Path, calib_file: Option<&Path>) -> Result<LocalizationResult
     let track = PoseTrack::read(path, calib_file)?;
     Ok(LocalizationResults {
         frames: (0..track.map_from_lidar.len()).collect(),
-        estimates_in_space: Some(in_world(&track)),
-        times_s: track.times_s,
+        estimates_in_space: Some(in_world(&track).into()),
+        times_s: track.times_s.map(Into::into),
         ..LocalizationResults::default()
     })
 }

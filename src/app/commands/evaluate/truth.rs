@@ -75,7 +75,7 @@ pub fn with_truth(
     }
     let truth: Vec<Pose3> = poses.into_iter().flatten().collect();
     results.ground_truth = Some(truth.iter().map(pose2_from_pose3).collect());
-    results.ground_truth_in_space = Some(truth);
+    results.ground_truth_in_space = Some(truth.into());
     Ok(results)
 }
 
@@ -211,14 +211,14 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
             "the positions are on a straight line, which determines no rigid alignment; set alignment to first",
         )?;
         if let Some(trajectory) = trajectory {
-            *trajectory = aligned(&transform, trajectory);
+            *trajectory = aligned(&transform, trajectory).into();
         }
         if let Some(poses) = poses {
             let moved = aligned(&transform, &level(poses));
             *poses = moved.iter().map(pose2_from_pose3).collect();
         }
         if let Some(estimates) = in_space {
-            *estimates = aligned(&transform, estimates);
+            *estimates = aligned(&transform, estimates).into();
         }
         if let (Some(poses), Some(in_space)) = (poses, in_space) {
             *poses = in_space.iter().map(pose2_from_pose3).collect();
@@ -265,9 +265,9 @@ mod tests {
         for alignment in [Alignment::First, Alignment::Rigid] {
             let mut results = LocalizationResults {
                 frames: (0..20).collect(),
-                estimates: Some(estimates.clone()),
-                ground_truth: Some(truth.clone()),
-                states: Some(states.clone()),
+                estimates: Some(estimates.clone().into()),
+                ground_truth: Some(truth.clone().into()),
+                states: Some(states.clone().into()),
                 ..LocalizationResults::default()
             };
             align(&mut results, alignment).unwrap();

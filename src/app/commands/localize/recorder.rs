@@ -1,21 +1,29 @@
 //! Results of localize, collected frame by frame.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Result;
+use bytemuck::Pod;
 
 use super::frame_tracker::TrackedFrame;
 use super::opened::Opened;
 
 use crate::app::report::LocalizationResults;
-use crate::app::report::results::{LiveSummary, ParticleLog, ResultWriter, RowLog, ScanOutline};
+use crate::app::report::results::{
+    Column, LiveSummary, ParticleLog, ResultWriter, RowLog, ScanOutline,
+};
 use crate::app::report::run_output::{self, Movie};
 use crate::app::run::{Claims, Interrupted};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
 use crate::localization::State;
 use crate::recording::{Frame, ScanSource};
+
+/// A column of the results, where it is kept.
+fn column<T: Pod>(is_kept: bool, folder: &Path) -> Option<Column<T>> {
+    is_kept.then(|| Column::in_folder(folder))
+}
 
 /// The localized frames.
 pub struct Run {
@@ -48,33 +56,30 @@ impl Run {
             .map(|frame| frame.number)
             .collect();
         let rows = selected.len();
-        // Columns are allocated for all frames at once where their number is known: a replay does not stop to copy them.
-        let (every, refined) = (Some(rows), is_refined.then_some(rows));
-        let truth = has_truth.then_some(rows);
         let mut run = Self {
             results: LocalizationResults {
-                frames: Vec::with_capacity(rows),
+                frames: Column::in_folder(folder),
                 particles: ParticleLog::new(config.tracker.localizer.num_particles, folder),
-                estimates: every.map(Vec::with_capacity),
-                refined: refined.map(Vec::with_capacity),
-                ground_truth: truth.map(Vec::with_capacity),
-                estimates_in_space: every.map(Vec::with_capacity),
-                refined_in_space: refined.map(Vec::with_capacity),
-                ground_truth_in_space: truth.map(Vec::with_capacity),
-                odometry: every.map(Vec::with_capacity),
-                covariances: every.map(Vec::with_capacity),
-                refined_covariances: refined.map(Vec::with_capacity),
-                times_s: every.map(Vec::with_capacity),
-                runtimes_s: every.map(Vec::with_capacity),
-                refine_runtimes_s: refined.map(Vec::with_capacity),
-                agreements: every.map(Vec::with_capacity),
-                places: every.map(Vec::with_capacity),
-                states: every.map(Vec::with_capacity),
+                estimates: column(true, folder),
+                refined: column(is_refined, folder),
+                ground_truth: column(has_truth, folder),
+                estimates_in_space: column(true, folder),
+                refined_in_space: column(is_refined, folder),
+                ground_truth_in_space: column(has_truth, folder),
+                odometry: column(true, folder),
+                covariances: column(true, folder),
+                refined_covariances: column(is_refined, folder),
+                times_s: column(true, folder),
+                runtimes_s: column(true, folder),
+                refine_runtimes_s: column(is_refined, folder),
+                agreements: column(true, folder),
+                places: column(true, folder),
+                states: column(true, folder),
                 trajectory_in_space: None,
                 trajectory_states: None,
-                refined_states: refined.map(Vec::with_capacity),
-                refinement_costs_m: refined.map(Vec::with_capacity),
-                refinement_agreements: refined.map(Vec::with_capacity),
+                refined_states: column(is_refined, folder),
+                refinement_costs_m: column(is_refined, folder),
+                refinement_agreements: column(is_refined, folder),
                 scan_outlines: (rows <= ScanOutline::MOST_FRAMES)
                     .then(|| RowLog::in_folder(folder)),
                 selected: (!opened.is_driving()).then_some(rows),
@@ -115,7 +120,7 @@ impl Run {
 
     /// Adds a frame.
     pub fn record(&mut self, frame: &Frame, scan: &Scan, tracked: &TrackedFrame) -> Result<()> {
-        fn push<T>(column: &mut Option<Vec<T>>, value: T) {
+        fn push<T: Pod>(column: &mut Option<Column<T>>, value: T) {
             if let Some(column) = column {
                 column.push(value);
             }

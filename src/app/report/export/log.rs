@@ -28,7 +28,7 @@ use super::messages::{
 };
 use super::sinks::{McapSink, MessageSink};
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, TRUTH};
-use crate::app::report::results::{LocalizationResults, stretches};
+use crate::app::report::results::{Column, LocalizationResults, stretches};
 use crate::evaluation::planar_errors;
 use crate::evaluation::trust::Axes;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3, pose3_from_pose2};
@@ -68,7 +68,7 @@ pub fn write_mcap(
             .map(|&frame| frame as f64 / 10.0)
             .collect()
     };
-    let times_s: Vec<f64> = results.times_s.clone().unwrap_or_else(assumed);
+    let times_s: Vec<f64> = (results.times_s.as_deref()).map_or_else(assumed, <[f64]>::to_vec);
     let first_s = times_s.iter().copied().reduce(f64::min).unwrap_or(0.0);
     let shift_s = (-first_s).max(0.0);
     let stamps = times_s.iter().map(|time_s| nanoseconds(time_s + shift_s));
@@ -116,14 +116,14 @@ impl RunLog<'_> {
 
 /// Trajectories of a run in space, where they are known.
 struct Trajectories {
-    estimates: Vec<Pose3>,
-    refined: Option<Vec<Pose3>>,
-    truth: Option<Vec<Pose3>>,
+    estimates: Column<Pose3>,
+    refined: Option<Column<Pose3>>,
+    truth: Option<Column<Pose3>>,
 }
 
 impl Trajectories {
     fn of(results: &LocalizationResults) -> Result<Self> {
-        let raised = |in_space: &Option<Vec<Pose3>>, planar: &Option<Vec<Pose2>>| {
+        let raised = |in_space: &Option<Column<Pose3>>, planar: &Option<Column<Pose2>>| {
             let planar = planar.as_ref().map(|poses| poses.iter());
             let raised = planar.map(|poses| poses.map(|pose| pose3_from_pose2(pose, 0.0)));
             in_space.clone().or(raised.map(Iterator::collect))
@@ -158,7 +158,7 @@ impl Trajectories {
                 .or(results.states.as_ref())?;
             Some(State::from_number(states[row])?.word())
         };
-        let covariance = |all: &Option<Vec<_>>| all.as_ref().map(|all| all[row]);
+        let covariance = |all: &Option<Column<_>>| all.as_ref().map(|all| all[row]);
         let of_estimate = covariance(&results.covariances);
         let estimate = odometry(&self.estimates[row], of_estimate, state(row), stamp);
         log.send("/estimate", stamp, &estimate)?;

@@ -139,13 +139,16 @@ mod tests {
             outlines.push(points).unwrap();
         }
         let results = LocalizationResults {
-            frames: vec![4, 5, 6],
+            frames: vec![4, 5, 6].into(),
             ground_truth: Some(truth),
-            states: Some(vec![
-                State::Searching as u8,
-                State::Tracking as u8,
-                State::Lost as u8,
-            ]),
+            states: Some(
+                vec![
+                    State::Searching as u8,
+                    State::Tracking as u8,
+                    State::Lost as u8,
+                ]
+                .into(),
+            ),
             scan_outlines: Some(outlines),
             ..LocalizationResults::default()
         };

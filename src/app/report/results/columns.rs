@@ -1,9 +1,149 @@
-//! Items of the columns of a result, as rows of numbers.
+//! Columns of a result, and their items as rows of numbers.
+
+use std::fmt;
+use std::marker::PhantomData;
+use std::ops::{Deref, DerefMut};
+use std::path::{Path, PathBuf};
+
+use bytemuck::Pod;
 
 use nalgebra::{Matrix3, Quaternion, Translation3, UnitQuaternion, Vector2};
 use npyz::AutoSerialize;
+use serde::{Serialize, Serializer};
 
 use crate::geometry::{Pose2, Pose3};
+use crate::shared_bytes::GrowingBytes;
+
+/// An item per frame: few in memory, many in an unnamed file, so that memory does not grow with a drive.
+pub struct Column<T> {
+    /// Folder of the file; by default that of temporary files.
+    folder: Option<PathBuf>,
+    items: Items<T>,
+}
+
+enum Items<T> {
+    InMemory(Vec<T>),
+    InFile(GrowingBytes, PhantomData<T>),
+}
+
+impl<T: Pod> Column<T> {
+    /// Largest size of the items in memory [bytes].
+    const MOST_BYTES: usize = 1 << 16;
+
+    /// An empty column whose file is in a folder, if it can be written there.
+    pub fn in_folder(folder: &Path) -> Self {
+        Self {
+            folder: Some(folder.to_owned()),
+            items: Items::InMemory(Vec::new()),
+        }
+    }
+
+    /// Appends an item. Where no file can be written, all stay in memory.
+    pub fn push(&mut self, item: T) {
+        if let Items::InFile(bytes, _) = &mut self.items {
+            if bytes.extend(bytemuck::bytes_of(&item)).is_ok() {
+                return;
+            }
+            self.items = Items::InMemory(self.to_vec());
+        }
+        if let Items::InMemory(items) = &mut self.items {
+            // Where the vector must grow anyway.
+            if items.len() == items.capacity() && size_of_val(&**items) >= Self::MOST_BYTES {
+                let (folder, bytes) = (self.folder.as_deref(), bytemuck::cast_slice(items));
+                if let Ok(mut bytes) = GrowingBytes::in_folder(folder, bytes)
+                    && bytes.extend(bytemuck::bytes_of(&item)).is_ok()
+                {
+                    self.items = Items::InFile(bytes, PhantomData);
+                    return;
+                }
+            }
+            items.push(item);
+        }
+    }
+}
+
+impl<T: Pod> Deref for Column<T> {
+    type Target = [T];
+
+    fn deref(&self) -> &[T] {
+        match &self.items {
+            Items::InMemory(items) => items,
+            Items::InFile(bytes, _) => bytemuck::cast_slice(bytes),
+        }
+    }
+}
+
+impl<T: Pod> DerefMut for Column<T> {
+    fn deref_mut(&mut self) -> &mut [T] {
+        match &mut self.items {
+            Items::InMemory(items) => items,
+            Items::InFile(bytes, _) => bytemuck::cast_slice_mut(bytes),
+        }
+    }
+}
+
+impl<T> From<Vec<T>> for Column<T> {
+    fn from(items: Vec<T>) -> Self {
+        Self {
+            folder: None,
+            items: Items::InMemory(items),
+        }
+    }
+}
+
+impl<T> FromIterator<T> for Column<T> {
+    fn from_iter<I: IntoIterator<Item = T>>(items: I) -> Self {
+        Vec::from_iter(items).into()
+    }
+}
+
+impl<'a, T: Pod> IntoIterator for &'a Column<T> {
+    type Item = &'a T;
+    type IntoIter = std::slice::Iter<'a, T>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
+    }
+}
+
+impl<'a, T: Pod> IntoIterator for &'a mut Column<T> {
+    type Item = &'a mut T;
+    type IntoIter = std::slice::IterMut<'a, T>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter_mut()
+    }
+}
+
+impl<T: Pod + Serialize> Serialize for Column<T> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        (**self).serialize(serializer)
+    }
+}
+
+impl<T> Default for Column<T> {
+    fn default() -> Self {
+        Vec::new().into()
+    }
+}
+
+impl<T: Pod> Clone for Column<T> {
+    fn clone(&self) -> Self {
+        self.to_vec().into()
+    }
+}
+
+impl<T: Pod + PartialEq> PartialEq for Column<T> {
+    fn eq(&self, other: &Self) -> bool {
+        **self == **other
+    }
+}
+
+impl<T: Pod + fmt::Debug> fmt::Debug for Column<T> {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        (**self).fmt(formatter)
+    }
+}
 
 /// An item of a column, as a row of `N` numbers.
 pub trait Row<const N: usize>: Sized {
@@ -103,5 +243,29 @@ impl Row<9> for Matrix3<f64> {
 
     fn from_row(row: [f64; 9]) -> Option<Self> {
         Some(Self::from_row_slice(&row))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_column_is_the_same_in_a_file_and_takes_no_memory_of_its_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut column = Column::in_folder(folder.path());
+        let pose = |k: u32| Pose2::new([f64::from(k), 0.5].into(), 0.1);
+        let all: Vec<Pose2> = (0..10_000).map(pose).collect();
+        all.iter().for_each(|&pose| column.push(pose));
+        assert!(matches!(column.items, Items::InFile(..)));
+        assert_eq!(*column, *all);
+        column[7] = pose(70);
+        column.push(pose(3));
+        assert_eq!((column[7], column[10_000]), (pose(70), pose(3)));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+        let copy = column.clone();
+        column[7] = pose(7);
+        assert_eq!(copy[7], pose(70));
+        assert_ne!(copy, column);
     }
 }

@@ -236,12 +236,12 @@ mod tests {
         let mut particles = ParticleLog::new(10, Path::new("."));
         (0..3).for_each(|_| particles.push_frame(&[[1.0; 4]; 2]).unwrap());
         let results = LocalizationResults {
-            frames: vec![1, 3, 5],
+            frames: vec![1, 3, 5].into(),
             particles,
-            estimates: Some(estimates),
-            ground_truth: Some(truth),
-            runtimes_s: Some(vec![0.01, 0.02, 0.03]),
-            covariances: Some(vec![Matrix3::from_diagonal(&[0.01, 4.0, 1e-4].into()); 3]),
+            estimates: Some(estimates.into()),
+            ground_truth: Some(truth.into()),
+            runtimes_s: Some(vec![0.01, 0.02, 0.03].into()),
+            covariances: Some(vec![Matrix3::from_diagonal(&[0.01, 4.0, 1e-4].into()); 3].into()),
             ..LocalizationResults::default()
         };
         write_frames_csv(&path, &results).unwrap();

@@ -28,9 +28,11 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
+use bytemuck::Pod;
 use glam::Vec3;
 use nalgebra::Matrix3;
 
+use super::columns::Column;
 use super::row_log::RowLog;
 use crate::evaluation::{ParticleRow, RangeMclRules};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
@@ -152,50 +154,50 @@ impl ScanOutline {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LocalizationResults {
     /// Numbers of the frames in their recording, ascending.
-    pub frames: Vec<usize>,
+    pub frames: Column<usize>,
     /// Particles after motion, weighting and resampling.
     pub particles: ParticleLog,
     /// The filter's estimates.
-    pub estimates: Option<Vec<Pose2>>,
+    pub estimates: Option<Column<Pose2>>,
     /// The refined trajectory.
-    pub refined: Option<Vec<Pose2>>,
+    pub refined: Option<Column<Pose2>>,
     /// The ground truth.
-    pub ground_truth: Option<Vec<Pose2>>,
+    pub ground_truth: Option<Column<Pose2>>,
     /// The filter's estimates in space, `map_from_lidar`.
-    pub estimates_in_space: Option<Vec<Pose3>>,
+    pub estimates_in_space: Option<Column<Pose3>>,
     /// The refined trajectory in space.
-    pub refined_in_space: Option<Vec<Pose3>>,
+    pub refined_in_space: Option<Column<Pose3>>,
     /// The ground truth in space.
-    pub ground_truth_in_space: Option<Vec<Pose3>>,
+    pub ground_truth_in_space: Option<Column<Pose3>>,
     /// The odometry increment into each frame, `previous_from_current`.
-    pub odometry: Option<Vec<Pose2>>,
+    pub odometry: Option<Column<Pose2>>,
     /// Covariances of the estimates in x, y [m], heading [rad].
-    pub covariances: Option<Vec<Matrix3<f64>>>,
+    pub covariances: Option<Column<Matrix3<f64>>>,
     /// Covariances of the refined poses.
-    pub refined_covariances: Option<Vec<Matrix3<f64>>>,
+    pub refined_covariances: Option<Column<Matrix3<f64>>>,
     /// Times of the frames [s].
-    pub times_s: Option<Vec<f64>>,
+    pub times_s: Option<Column<f64>>,
     /// Computing time of localization per frame [s].
-    pub runtimes_s: Option<Vec<f64>>,
+    pub runtimes_s: Option<Column<f64>>,
     /// Computing time of refinement per frame [s].
-    pub refine_runtimes_s: Option<Vec<f64>>,
+    pub refine_runtimes_s: Option<Column<f64>>,
     /// Share of the beams above the road that agree with the map, −1 where unknown (unitless).
-    pub agreements: Option<Vec<f64>>,
+    pub agreements: Option<Column<f64>>,
     /// Number of places where the car may be.
-    pub places: Option<Vec<f64>>,
+    pub places: Option<Column<f64>>,
     /// State of the filter as a number.
-    pub states: Option<Vec<u8>>,
+    pub states: Option<Column<u8>>,
     /// The estimates in space and, before the first tracked frame, poses that follow from it by the odometry and agree
     /// with the map; `None` where the estimates are the trajectory.
-    pub trajectory_in_space: Option<Vec<Pose3>>,
+    pub trajectory_in_space: Option<Column<Pose3>>,
     /// State of each pose of that trajectory as a number.
-    pub trajectory_states: Option<Vec<u8>>,
+    pub trajectory_states: Option<Column<u8>>,
     /// State of each refined pose as a number.
-    pub refined_states: Option<Vec<u8>>,
+    pub refined_states: Option<Column<u8>>,
     /// Mean cost of the differences to the map before and after the refinement of a frame [m]; −1 where it was not refined.
-    pub refinement_costs_m: Option<Vec<[f64; 2]>>,
+    pub refinement_costs_m: Option<Column<[f64; 2]>>,
     /// Share of the compared beams that agree with the map before and after, −1 where unknown (unitless).
-    pub refinement_agreements: Option<Vec<[f64; 2]>>,
+    pub refinement_agreements: Option<Column<[f64; 2]>>,
     /// Outlines of the scans, for pictures.
     pub scan_outlines: Option<RowLog<[i16; 2]>>,
     /// Number of frames to localize; a file has it only if the run ended before the last of them.
@@ -265,9 +267,9 @@ impl LocalizationResults {
     /// The results of a subset of the rows.
     #[must_use]
     pub fn select(&self, rows: &[usize]) -> Self {
-        fn pick<T: Clone>(column: &Option<Vec<T>>, rows: &[usize]) -> Option<Vec<T>> {
+        fn pick<T: Pod>(column: &Option<Column<T>>, rows: &[usize]) -> Option<Column<T>> {
             let column = column.as_ref()?;
-            Some(rows.iter().map(|&row| column[row].clone()).collect())
+            Some(rows.iter().map(|&row| column[row]).collect())
         }
         let mut particles = self.particles.clone();
         if !particles.is_empty() {
@@ -288,7 +290,7 @@ impl LocalizationResults {
     /// of a trajectory without particles.
     pub fn estimates_or_particle_means(&self, rules: &RangeMclRules) -> Result<Vec<Pose2>> {
         if let Some(estimates) = &self.estimates {
-            return Ok(estimates.clone());
+            return Ok(estimates.to_vec());
         }
         if let (true, Some(estimates)) = (self.particles.is_empty(), &self.estimates_in_space) {
             return Ok(estimates.iter().map(pose2_from_pose3).collect());

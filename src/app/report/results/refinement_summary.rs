@@ -3,6 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::columns::Column;
 use super::localization_results::LocalizationResults;
 use super::rows::{MetricRow, Value, length, metrics};
 use super::run_summary::RunSummary;
@@ -41,7 +42,7 @@ impl RefinementSummary {
             .filter(|&(row, _)| before[row] && after[row] && !results.is_only_smoothed(row))
             .map(|(_, it)| it)
             .collect();
-        let known = |column: &Option<Vec<[f64; 2]>>| -> Vec<[f64; 2]> {
+        let known = |column: &Option<Column<[f64; 2]>>| -> Vec<[f64; 2]> {
             let rows = column.iter().flatten().zip(&after);
             rows.filter(|(pair, trusted)| **trusted && pair.iter().all(|&it| it >= 0.0))
                 .map(|(pair, _)| *pair)
@@ -130,10 +131,10 @@ mod tests {
         refined[2] = at(2.25);
         let mut results = LocalizationResults {
             frames: (0..4).collect(),
-            refined: Some(refined),
-            refined_states: Some(vec![1; 4]),
-            states: Some(vec![1; 4]),
-            refinement_costs_m: Some(vec![[-1.0; 2], [0.2, 0.1], [0.2, 0.1], [-1.0; 2]]),
+            refined: Some(refined.into()),
+            refined_states: Some(vec![1; 4].into()),
+            states: Some(vec![1; 4].into()),
+            refinement_costs_m: Some(vec![[-1.0; 2], [0.2, 0.1], [0.2, 0.1], [-1.0; 2]].into()),
             ..LocalizationResults::default()
         };
         let summary = RefinementSummary::of(&results, &estimates).unwrap();
@@ -145,7 +146,7 @@ mod tests {
         );
         assert!(!summary.verdict().contains("Less than half"));
 
-        results.refined_states = Some(vec![1, 0, 0, 0]);
+        results.refined_states = Some(vec![1, 0, 0, 0].into());
         let summary = RefinementSummary::of(&results, &estimates).unwrap();
         assert_eq!((summary.refused, summary.moved_m.is_none()), (3, true));
         let verdict = summary.verdict();

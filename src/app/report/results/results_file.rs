@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
 
-use super::columns::Row;
+use bytemuck::Pod;
+
+use super::columns::{Column, Row};
 use super::localization_results::{LocalizationResults, ParticleLog, ScanOutline, columns};
 use super::npz::{Array, NpzReader, not_valid, write_npy};
 use super::npz_writer::{ArrayStream, NpzWriter};
@@ -15,6 +17,7 @@ use crate::app::run::output;
 use crate::evaluation::ParticleRow;
 use crate::files::{AtomicFile, folder_of};
 use crate::geometry::Pose2;
+use crate::shared_bytes::unnamed_file;
 
 /// Largest number of particles in empty rows, 4 GiB of zeros.
 const MOST_EMPTY_PARTICLES: usize = 1 << 28;
@@ -73,7 +76,7 @@ impl LocalizationResults {
                 writer.particles = Some(stream);
             }
             if self.scan_outlines.is_some() {
-                let file = tempfile::tempfile_in(folder_of(path))?;
+                let file = unnamed_file(Some(folder_of(path)))?;
                 let row = [2 * ScanOutline::MAX];
                 let mut stream = ArrayStream::begin(file, "scan_outlines", "<i2", &row)?;
                 let empty = [[0_i16; 2]; ScanOutline::MAX];
@@ -278,7 +281,10 @@ struct RowReader<'a> {
 impl RowReader<'_> {
     /// Reads an array of finite numbers, a row per item. `None` if it is missing, or empty, which means the
     /// same in range-mcl.
-    fn column<T: Row<N>, const N: usize>(&mut self, name: &'static str) -> Result<Option<Vec<T>>> {
+    fn column<T: Row<N> + Pod, const N: usize>(
+        &mut self,
+        name: &'static str,
+    ) -> Result<Option<Column<T>>> {
         let Some(mut array) = self.npz.array(name)? else {
             return Ok(None);
         };
@@ -323,12 +329,12 @@ impl RowReader<'_> {
     }
 
     /// Reads the frame of each row: the row itself if the file does not contain `frames`.
-    fn frames(&mut self) -> Result<Vec<usize>> {
+    fn frames(&mut self) -> Result<Column<usize>> {
         let Some(frames) = self.column::<f64, 1>("frames")? else {
             return Ok((self.first..self.rows).collect());
         };
         let mut previous = -1.0;
-        for (row, &frame) in (self.first..).zip(&frames) {
+        for (row, &frame) in (self.first..).zip(&*frames) {
             if frame <= previous || frame.fract() != 0.0 {
                 return Err(not_valid(self.path, "frames", row, frame));
             }

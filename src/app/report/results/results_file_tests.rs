@@ -21,12 +21,12 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
     }
     let poses = |offset: f64| {
         let pose = |&frame: &usize| Pose2::new([frame as f64, offset].into(), 3.0 - offset);
-        Some(frames.iter().map(pose).collect::<Vec<_>>())
+        Some(frames.iter().map(pose).collect())
     };
     // Quaternions of exactly unit length are read back bit by bit.
     let in_space = |height: f64| {
         let pose = |&frame: &usize| Pose3::translation(frame as f64, 0.5, height);
-        Some(frames.iter().map(pose).collect::<Vec<_>>())
+        Some(frames.iter().map(pose).collect())
     };
     let numbers = |scale: f64| Some(frames.iter().map(|&f| scale * f as f64).collect());
     let matrix = |&frame: &usize| Matrix3::from_diagonal_element(1.0 + frame as f64);
@@ -61,7 +61,7 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         scan_outlines: Some(outlines),
         selected: Some(40),
         times_are_assumed: true,
-        frames,
+        frames: frames.into(),
     }
 }
 
@@ -74,7 +74,7 @@ fn assert_same(a: &LocalizationResults, b: &LocalizationResults) {
             &results.odometry,
         ]
         .into_iter()
-        .flat_map(|poses| poses.clone().unwrap())
+        .flat_map(|poses| poses.as_ref().unwrap().to_vec())
         .collect()
     };
     for (a, b) in poses(a).iter().zip(&poses(b)) {
@@ -160,7 +160,7 @@ fn a_file_of_range_mcl_alone_is_read() {
     npz.add("numParticles", &[], [4_i64]).unwrap();
     npz.finish().unwrap();
     let results = LocalizationResults::read(&path).unwrap();
-    assert_eq!(results.frames, [1, 2]);
+    assert_eq!(*results.frames, [1, 2]);
     assert_eq!(results.particles.frame(1).unwrap(), [[1.0; 4]]);
     assert_eq!(results.estimates, None);
 }
@@ -338,13 +338,13 @@ fn inconsistent_arrays_are_errors_that_name_the_array() {
     assert!(message.contains("is not a valid value"), "{message}");
 
     let mut far = results(0..2);
-    far.frames = vec![10, usize::MAX];
+    far.frames = vec![10, usize::MAX].into();
     far.write(&path).unwrap();
     let message = LocalizationResults::read(&path).unwrap_err().to_string();
     assert!(message.contains("`frames`, row 1"), "{message}");
 
     let mut disordered = results(0..3);
-    disordered.frames = vec![4, 6, 5];
+    disordered.frames = vec![4, 6, 5].into();
     disordered.write(&path).unwrap();
     let message = LocalizationResults::read(&path).unwrap_err().to_string();
     assert!(message.contains("`frames`, row 2: 5"), "{message}");

@@ -3,11 +3,13 @@
 use std::fmt;
 use std::fs::File;
 use std::io::{self, Read as _, Seek as _, SeekFrom, Write as _};
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytemuck::Pod;
+
+use super::columns::Column;
+use crate::shared_bytes::unnamed_file;
 
 /// Rows that are appended and read by their index.
 #[derive(Clone, Default)]
@@ -19,8 +21,8 @@ pub struct RowLog<T> {
     in_file: usize,
     /// The last items.
     last: Vec<T>,
-    /// Indices of the items of each row.
-    rows: Vec<Range<usize>>,
+    /// First index of the items of each row, and that after the last.
+    rows: Column<[usize; 2]>,
 }
 
 impl<T: Pod> RowLog<T> {
@@ -34,7 +36,7 @@ impl<T: Pod> RowLog<T> {
             file: None,
             in_file: 0,
             last: Vec::new(),
-            rows: Vec::new(),
+            rows: Column::in_folder(folder),
         }
     }
 
@@ -45,14 +47,15 @@ impl<T: Pod> RowLog<T> {
 
     /// Number of items of a row.
     pub fn row_len(&self, row: usize) -> usize {
-        self.rows[row].len()
+        let [start, end] = self.rows[row];
+        end - start
     }
 
     /// A subset of the rows.
     #[must_use]
     pub fn select(&self, rows: &[usize]) -> Self {
         Self {
-            rows: rows.iter().map(|&row| self.rows[row].clone()).collect(),
+            rows: rows.iter().map(|&row| self.rows[row]).collect(),
             ..self.clone()
         }
     }
@@ -64,7 +67,7 @@ impl<T: Pod> RowLog<T> {
         }
         let start = self.in_file + self.last.len();
         self.last.extend_from_slice(items);
-        self.rows.push(start..start + items.len());
+        self.rows.push([start, start + items.len()]);
         Ok(())
     }
 
@@ -76,11 +79,7 @@ impl<T: Pod> RowLog<T> {
         let file = match &self.file {
             Some(file) => file,
             None => {
-                let in_folder = self.folder.as_deref().map(tempfile::tempfile_in);
-                let file = match in_folder {
-                    Some(Ok(file)) => file,
-                    _ => tempfile::tempfile()?,
-                };
+                let file = unnamed_file(self.folder.as_deref())?;
                 self.file.insert(Arc::new(Mutex::new(file)))
             }
         };
@@ -94,7 +93,7 @@ impl<T: Pod> RowLog<T> {
 
     /// The items of a row.
     pub fn row(&self, row: usize) -> io::Result<Vec<T>> {
-        let Range { start, end } = self.rows[row].clone();
+        let [start, end] = self.rows[row];
         if let (Some(start), Some(end)) = (
             start.checked_sub(self.in_file),
             end.checked_sub(self.in_file),

@@ -4,6 +4,7 @@ use nalgebra::Matrix3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::columns::Column;
 use super::localization_results::LocalizationResults;
 use super::rows::{MetricRow, length, metrics};
 use super::trusted::trusted_distances_m;
@@ -57,7 +58,7 @@ impl RunSummary {
             tracked: results.tracked(),
             covariances: results.covariances.as_deref(),
         };
-        let several = |places: &Vec<f64>| places.iter().filter(|&&it| it > 1.0).count();
+        let several = |places: &Column<f64>| places.iter().filter(|&&it| it > 1.0).count();
         Self {
             ambiguous: results.places.as_ref().map(several),
             ..Self::of_trajectory(results, &trajectory, |row| {
@@ -194,8 +195,8 @@ mod tests {
             .collect();
         let speed = |times_s: [f64; 3], times_are_assumed: bool| {
             let results = LocalizationResults {
-                frames: vec![1, 2, 3],
-                times_s: Some(times_s.to_vec()),
+                frames: vec![1, 2, 3].into(),
+                times_s: Some(times_s.to_vec().into()),
                 times_are_assumed,
                 ..LocalizationResults::default()
             };
@@ -216,26 +217,26 @@ mod tests {
         let estimates = vec![Pose2::identity(); 30];
         let mut results = LocalizationResults {
             frames: (0..30).collect(),
-            states: Some(states(1..15)),
-            trajectory_states: Some(states(0..15)),
+            states: Some(states(1..15).into()),
+            trajectory_states: Some(states(0..15).into()),
             ..LocalizationResults::default()
         };
         let summary = RunSummary::of(&results, &estimates);
         assert_eq!((summary.tracking, summary.filled), (Some(14), Some(1)));
         assert_eq!(summary.localized(), Some(false));
         // Also where the filled ones are part of a refined trajectory that has no scan of them.
-        results.refined = Some(estimates.clone());
-        results.refined_states = Some(states(0..15));
+        results.refined = Some(estimates.clone().into());
+        results.refined_states = Some(states(0..15).into());
         let mut costs_m = vec![[0.2, 0.1]; 30];
         costs_m[0] = [-1.0; 2];
-        results.refinement_costs_m = Some(costs_m.clone());
+        results.refinement_costs_m = Some(costs_m.clone().into());
         let refined = |results: &_| RunSummary::of_refined(results).unwrap();
         assert_eq!(refined(&results).filled, Some(1));
         assert_eq!(refined(&results).localized(), Some(false));
         costs_m[0] = [0.2, 0.1];
-        results.refinement_costs_m = Some(costs_m);
+        results.refinement_costs_m = Some(costs_m.into());
         assert_eq!(refined(&results).localized(), Some(true));
-        results.states = Some(states(0..15));
+        results.states = Some(states(0..15).into());
         assert_eq!(RunSummary::of(&results, &estimates).localized(), Some(true));
         assert_eq!(State::Tracking as u8, 1);
     }
@@ -244,14 +245,15 @@ mod tests {
     fn uncertainty_is_that_of_the_tracked_frames() {
         let estimates = vec![Pose2::identity(); 2];
         let results = LocalizationResults {
-            frames: vec![4, 5],
-            states: Some(vec![State::Lost as u8, State::Tracking as u8]),
+            frames: vec![4, 5].into(),
+            states: Some(vec![State::Lost as u8, State::Tracking as u8].into()),
             covariances: Some(
                 [100.0, 4.0]
                     .map(nalgebra::Matrix3::from_diagonal_element)
-                    .to_vec(),
+                    .to_vec()
+                    .into(),
             ),
-            agreements: Some(vec![0.1, -1.0]),
+            agreements: Some(vec![0.1, -1.0].into()),
             ..LocalizationResults::default()
         };
         let summary = RunSummary::of(&results, &estimates);

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use super::columns::Column;
 use super::localization_results::LocalizationResults;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::localization::State;
@@ -35,12 +36,12 @@ impl LocalizationResults {
     }
 
     /// States of the trajectory of the filter, where any are known.
-    pub fn trajectory_states(&self) -> Option<&Vec<u8>> {
+    pub fn trajectory_states(&self) -> Option<&Column<u8>> {
         self.trajectory_states.as_ref().or(self.states.as_ref())
     }
 
     /// The trajectory of the filter in space, where it is known.
-    pub fn trajectory_in_space(&self) -> Option<&Vec<Pose3>> {
+    pub fn trajectory_in_space(&self) -> Option<&Column<Pose3>> {
         let trajectory = self.trajectory_in_space.as_ref();
         trajectory.or(self.estimates_in_space.as_ref())
     }
@@ -61,7 +62,7 @@ impl LocalizationResults {
         }
     }
 
-    fn tracking(&self, states: Option<&Vec<u8>>) -> Vec<bool> {
+    fn tracking(&self, states: Option<&Column<u8>>) -> Vec<bool> {
         let is_tracking = |&state: &u8| state == State::Tracking as u8;
         states.map_or_else(
             || vec![true; self.len()],
@@ -134,15 +135,15 @@ mod tests {
     fn the_states_of_a_trajectory_precede_those_of_the_filter() {
         let [searching, tracking] = [State::Searching, State::Tracking].map(|it| it as u8);
         let mut results = LocalizationResults {
-            frames: vec![3, 4],
+            frames: vec![3, 4].into(),
             ..LocalizationResults::default()
         };
         assert_eq!(results.trusted(), [true, true]);
-        results.states = Some(vec![searching, tracking]);
+        results.states = Some(vec![searching, tracking].into());
         assert_eq!(results.refined_trusted(), [false, true]);
-        results.trajectory_states = Some(vec![tracking, tracking]);
+        results.trajectory_states = Some(vec![tracking, tracking].into());
         assert_eq!(results.trusted(), [true, true]);
-        results.refined_states = Some(vec![tracking, searching]);
+        results.refined_states = Some(vec![tracking, searching].into());
         assert_eq!(results.refined_trusted(), [true, false]);
     }
 }

@@ -118,7 +118,7 @@ impl<'a> Drawing<'a> {
     ) -> Self {
         let is_given = results.particles.is_empty();
         let in_space = results.estimates_in_space.iter().flatten();
-        let estimates = results.estimates.clone();
+        let estimates = results.estimates.as_deref().map(<[Pose2]>::to_vec);
         let estimates = estimates.unwrap_or_else(|| in_space.map(pose2_from_pose3).collect());
         Self {
             files,
@@ -436,7 +436,7 @@ mod tests {
     fn time_starts_at_zero_and_without_times_frames_are_counted() {
         let mut results = results(3);
         assert_eq!(time_axis(&results), (FRAME, vec![0.0, 1.0, 2.0]));
-        results.times_s = Some(vec![1e9, 1e9 + 0.5, 1e9 + 1.0]);
+        results.times_s = Some(vec![1e9, 1e9 + 0.5, 1e9 + 1.0].into());
         assert_eq!(time_axis(&results).1, [0.0, 0.5, 1.0]);
     }
 }
