@@ -404,6 +404,21 @@ fn points_of_livox_have_times_lines_and_reflectivities() {
     }
 }
 
+#[cfg(target_os = "linux")]
+#[test]
+fn a_database_below_a_folder_whose_name_is_no_text_is_read() {
+    use std::os::unix::ffi::OsStrExt as _;
+
+    let folder = tempfile::tempdir().unwrap();
+    let drive = (folder.path()).join(std::ffi::OsStr::from_bytes(b"100%\xff?a=b#\n"));
+    fs::create_dir(&drive).unwrap();
+    let path = folder.path().join("all.db3");
+    db3(&path, &recording(Kind::CdrLittle));
+    fs::rename(&path, drive.join("all.db3")).unwrap();
+    let bag = Bag::open(&drive.join("all.db3")).unwrap();
+    assert_eq!(bag.read_scan("/points", 4).unwrap().points.len(), 40);
+}
+
 #[test]
 fn the_mounting_follows_from_the_static_transforms() {
     let folder = tempfile::tempdir().unwrap();

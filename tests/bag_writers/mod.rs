@@ -178,6 +178,25 @@ pub fn pose_stamped(kind: Kind, stamp_ns: u64, frame: &str, pose: &[f64; 7]) -> 
     to.bytes
 }
 
+/// `geometry_msgs/PoseWithCovarianceStamped`, with the variances of x, y and heading.
+pub fn proposal(
+    kind: Kind,
+    stamp_ns: u64,
+    frame: &str,
+    pose: &[f64; 7],
+    variances: [f64; 3],
+) -> Vec<u8> {
+    let mut covariance = [0.0; 36];
+    for (place, variance) in [0, 7, 35].into_iter().zip(variances) {
+        covariance[place] = variance;
+    }
+    let mut to = Serializer::new(kind);
+    to.header(stamp_ns, frame)
+        .numbers(pose)
+        .numbers(&covariance);
+    to.bytes
+}
+
 /// `tf2_msgs/TFMessage` of transforms from child to parent.
 pub fn transforms(kind: Kind, tree: &[(&str, &str, [f64; 7])]) -> Vec<u8> {
     let mut to = Serializer::new(kind);

@@ -46,6 +46,16 @@ pub fn database(u: &mut Unstructured) -> Result<Vec<u8>> {
 #[cfg(feature = "ros2")]
 pub fn message(u: &mut Unstructured) -> Result<Vec<u8>> {
     let kind = *u.choose(&[Kind::CdrLittle, Kind::CdrBig])?;
+    if u.ratio(1, 4)? {
+        let variances = [u.arbitrary()?, u.arbitrary()?, u.arbitrary()?];
+        return Ok(crate::bag_writers::proposal(
+            kind,
+            1 << 29,
+            "map",
+            &pose(u)?,
+            variances,
+        ));
+    }
     Ok(recording(u, kind)?.swap_remove(0).data)
 }
 

@@ -489,6 +489,28 @@ mod tests {
     }
 
     #[test]
+    fn of_a_thousand_stacked_squares_a_cell_has_the_lowest_levels_and_chunks_in_memory_are_bounded()
+    {
+        let square = |height_m: f64, at: DVec3, side: f64| {
+            let corners = [DVec3::ZERO, side * DVec3::X, side * DVec3::Y];
+            corners.map(|corner| at + corner + DVec3::Z * height_m)
+        };
+        let stack = (0..1000).map(|k| square(4.0 * f64::from(k), DVec3::ZERO, 1.0));
+        let heights = Heights::of_triangles(stack, 0.25);
+        let levels: Vec<f64> = heights.reader().levels_m((0, 0)).unwrap().collect();
+        let lowest: Vec<f64> = (0..MOST_LEVELS).map(|k| 4.0 * k as f64).collect();
+        assert_eq!(levels, lowest);
+        // Each chunk of 32 levels has half a megabyte.
+        let wide = (0..32).map(|k| square(4.0 * f64::from(k), DVec3::ZERO, 2e4));
+        let triangles = GroundTriangles::new(wide.collect(), 0.5);
+        for chunk in 0..200 {
+            assert!(triangles.chunk((chunk, 0)).unwrap().is_some());
+            let bytes = triangles.made.read().unwrap().bytes;
+            assert!(bytes < KEPT_BYTES + (1 << 20), "{bytes}");
+        }
+    }
+
+    #[test]
     fn the_chunks_of_triangles_are_the_same_one_by_one_and_a_large_one_has_heights_everywhere() {
         let mut corners = Vec::new();
         for i in 0..300 {

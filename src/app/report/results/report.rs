@@ -422,6 +422,18 @@ mod tests {
     }
 
     #[test]
+    fn names_from_outside_are_no_markup_in_the_report() {
+        let mut named = report();
+        let name = "`<b>x</b>`\n| \u{1b}[2Jmap\u{202e}".to_owned();
+        named.about = [("map".to_owned(), name)].into();
+        let markdown = named.to_markdown();
+        let first = markdown.lines().next().unwrap();
+        assert_eq!(first.matches('`').count(), 2, "{first}");
+        assert!(first.starts_with("- map: `'<b>x</b>'"), "{first}");
+        assert!(first.ends_with('`') && !first.contains(['\u{1b}', '\u{202e}']));
+    }
+
+    #[test]
     fn numbers_keep_four_digits() {
         for (number, text) in [
             (0.018_93, "0.0189"),

@@ -274,3 +274,49 @@ fn name_of(path: &Path) -> Cow<'_, str> {
         name => name,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn outputs(main: &Path) -> Outputs<'_> {
+        Outputs {
+            key: "output",
+            main,
+            magic: None,
+            names: vec!["report.json".to_owned()],
+            inputs: Vec::new(),
+            force: false,
+        }
+    }
+
+    #[test]
+    fn a_name_with_a_newline_claims_no_other_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let victim = folder.path().join("victim.npz");
+        fs::write(&victim, "of the user").unwrap();
+        let main = folder.path().join("x\nfinished victim.npz");
+        let mut claims = outputs(&main).prepare().unwrap();
+        claims.begin(&main).unwrap();
+        let claims = Claims::read(folder.path()).unwrap();
+        assert_eq!(claims.state(&main), Some("unfinished"));
+        assert_eq!(claims.state(&victim), None);
+        assert!(outputs(&victim).prepare().is_err());
+        assert_eq!(fs::read(&victim).unwrap(), b"of the user");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn claims_are_not_written_through_a_link() {
+        let folder = tempfile::tempdir().unwrap();
+        let notes = folder.path().join("notes");
+        fs::write(&notes, "of the user").unwrap();
+        let results = folder.path().join("results");
+        fs::create_dir(&results).unwrap();
+        std::os::unix::fs::symlink(&notes, results.join(CLAIMS_FILE)).unwrap();
+        let main = results.join("localization.npz");
+        let error = outputs(&main).prepare().err().unwrap();
+        assert!(format!("{error:#}").contains("it is a link"), "{error:#}");
+        assert_eq!(fs::read(&notes).unwrap(), b"of the user");
+    }
+}
