@@ -513,6 +513,9 @@ mod tests {
         ]);
         let expected = vec![1532402927.647951, 1532402928.147847];
         assert_eq!(times_of(&nuscenes), (expected, true));
+        // Ten digits of KITTI raw are a number.
+        let raw = scans(&["0000000000.bin", "0000000001.bin"]);
+        assert_eq!(times_of(&raw), (vec![0.0, 0.1], false));
         let numbered = scans(&["0.bin", "1.bin", "2.bin"]);
         let write = |name: &str, text: &str| {
             fs::write(numbered.path().join(name), text).unwrap();

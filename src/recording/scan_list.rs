@@ -130,6 +130,10 @@ fn time_in_name(path: &Path) -> Option<f64> {
     if is_number(before, 10..=10) && is_number(last, 1..=9) {
         return Some(before.parse::<f64>().ok()? + last.parse::<f64>().ok()? * 1e-9);
     }
+    // Leading zeros are those of a number: `0000000000.bin` (KITTI raw).
+    if last.starts_with('0') {
+        return None;
+    }
     let number: f64 = last.parse().ok()?;
     let digits = last.split('.').next()?.len();
     match digits {
