@@ -3,11 +3,11 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use nalgebra::{Quaternion, UnitQuaternion};
+use nalgebra::Quaternion;
 
 use super::calibration::Calibration;
 use super::error::RecordingError;
-use super::table::{pose_from_row, position, read_rows, row_array, row_from_pose};
+use super::table::{pose_from_row, position, read_rows, rotation, row_array, row_from_pose};
 use crate::geometry::{Pose3, StampedPose};
 
 /// Camera poses of a recording, one per frame: `p_world = world_from_cam0 * p_cam0`.
@@ -144,8 +144,6 @@ pub fn write_exact_tum(mut writer: impl Write, trajectory: &[StampedPose]) -> io
 /// # Errors
 /// The file cannot be read, or a row does not have eight numbers of a pose.
 pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
-    /// Difference to 1 of the norm of a quaternion that is normalized up to rounding.
-    const NORMALIZED: f64 = 1e-14;
     read_rows(path)?
         .iter()
         .enumerate()
@@ -153,19 +151,7 @@ pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
             let [time_s, x, y, z, qx, qy, qz, qw] =
                 row_array(row, path, *line, "time x y z qx qy qz qw")?;
             check_time(time_s, path, *line)?;
-            let quaternion = Quaternion::new(qw, qx, qy, qz);
-            let excess = (quaternion.norm() - 1.0).abs();
-            if excess > 0.01 {
-                return Err(RecordingError::NotARotation {
-                    path: path.to_owned(),
-                    line: *line,
-                });
-            }
-            let rotation = if excess < NORMALIZED {
-                UnitQuaternion::new_unchecked(quaternion)
-            } else {
-                UnitQuaternion::from_quaternion(quaternion)
-            };
+            let rotation = rotation(Quaternion::new(qw, qx, qy, qz), path, *line)?;
             Ok(StampedPose {
                 frame,
                 time_s,
@@ -190,7 +176,7 @@ pub fn read_times(path: &Path) -> Result<Vec<f64>, RecordingError> {
 }
 
 /// Returns a time that a clock can show, from 1653 to 2286 if it counts from 1970 [s].
-fn check_time(time_s: f64, path: &Path, line: usize) -> Result<f64, RecordingError> {
+pub fn check_time(time_s: f64, path: &Path, line: usize) -> Result<f64, RecordingError> {
     if time_s.abs() <= 1e10 {
         return Ok(time_s);
     }

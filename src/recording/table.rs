@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
+use nalgebra::{Isometry3, Matrix3, Quaternion, Rotation3, Translation3, UnitQuaternion};
 
 use super::error::RecordingError;
 use crate::geometry::{FARTHEST_M, Pose3};
@@ -98,6 +98,28 @@ pub fn position(
         }),
         None => Ok(Translation3::new(x, y, z)),
     }
+}
+
+/// A quaternion that is normalized up to a hundredth, as a rotation; one up to rounding keeps its numbers.
+pub fn rotation(
+    quaternion: Quaternion<f64>,
+    path: &Path,
+    line: usize,
+) -> Result<UnitQuaternion<f64>, RecordingError> {
+    /// Difference to 1 of the norm of a quaternion that is normalized up to rounding.
+    const NORMALIZED: f64 = 1e-14;
+    let excess = (quaternion.norm() - 1.0).abs();
+    if excess > 0.01 {
+        return Err(RecordingError::NotARotation {
+            path: path.to_owned(),
+            line,
+        });
+    }
+    Ok(if excess < NORMALIZED {
+        UnitQuaternion::new_unchecked(quaternion)
+    } else {
+        UnitQuaternion::from_quaternion(quaternion)
+    })
 }
 
 /// The rotation nearest to a matrix, `U Vᵀ` of its singular value decomposition.
