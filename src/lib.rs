@@ -53,7 +53,7 @@
 //! | frame | origin and axes | appears in |
 //! |---|---|---|
 //! | `lidar` | the sensor; z up, and x forward, y left in KITTI's scans | scans, range images |
-//! | `map` | the `lidar` frame of the first pose of the recording, or that of the poses given to [`map::MapBuilder`] | map, particles, trajectories |
+//! | `map` | the `lidar` frame of the first pose of the recording, turned upright where an inertial sensor is given, or that of the poses given to [`map::MapBuilder`] | map, particles, trajectories |
 //! | `cam0` | left grey camera; x right, y down, z forward | KITTI's pose files, nowhere else |
 //! | `body` | what the poses of a recording are poses of, if not the lidar or a camera | [`recording`] |
 //! | `world` | that of the poses of a recording | [`recording`], to compare drives of one place |
@@ -75,7 +75,7 @@
 //! |---|---|
 //! | foundations | `files`, [`geometry`], [`memory`], `random`, `shared_bytes`, `simd`, `statistics`, [`validation`] |
 //! | configurations as texts, with a feature | `configuration` |
-//! | sensor and rays | [`lidar`], `raycasting` |
+//! | sensor and rays | [`inertial`], [`lidar`], `raycasting` |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | motion | [`odometry`] |
 //! | inferred sensor | [`sensor`] |
@@ -112,6 +112,7 @@ pub mod validation;
 #[cfg(feature = "configuration")]
 pub mod configuration;
 // Sensor and rays.
+pub mod inertial;
 pub mod lidar;
 mod raycasting;
 // Scans, points and meshes.

@@ -184,6 +184,9 @@ fn read_bag(file: &Input) -> Result<(), String> {
             check_pose(&pose.parent_from_child);
         }
     }
+    for topic in bag.topics_of(TopicKind::Inertial) {
+        bag.imu(&topic.name).map_err(text)?;
+    }
     bag.static_transforms().map_err(text)?;
     Ok(())
 }

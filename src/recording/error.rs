@@ -3,6 +3,8 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use crate::inertial::ImuError;
+
 /// A file of a recording that cannot be read or used.
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages are the documentation")]
@@ -91,6 +93,17 @@ pub enum RecordingError {
     },
     #[error("{} has no calib_imu_to_velo.txt in its folder or above it; copy it there from the archive of the calibration", path.display())]
     NoImuCalibration { path: PathBuf },
+    #[error("{} {problem}", path.display())]
+    BadImu { path: PathBuf, problem: ImuError },
+    #[error("{}: the header `{header}` does not name one time, three angular rates (gyro_x ...) and three forces (acc_x ...)", path.display())]
+    ImuColumns { path: PathBuf, header: String },
+    #[error("{}: the unit of the {quantity} is unknown: {value:.3e} {of}; state it in a header such as time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,acc_x_m_s2,acc_y_m_s2,acc_z_m_s2", path.display())]
+    ImuUnit {
+        path: PathBuf,
+        quantity: &'static str,
+        value: f64,
+        of: &'static str,
+    },
     #[error("{} has no time: times.txt has {times} rows; give one row per scan, or remove the file to assume 10 scans per second", scan.display())]
     ScanWithoutTime { scan: PathBuf, times: usize },
     #[error("{missing} of {scans} scans have no pose: the scans are from {first_scan_s:.3} to {last_scan_s:.3} s and the {poses} poses of {} from {first_pose_s:.3} to {last_pose_s:.3} s; give poses of this recording with times of the same clock", pose_file.display())]

@@ -22,6 +22,8 @@ pub(crate) mod calibration;
 mod oxts;
 pub(crate) mod poses;
 pub(crate) mod track;
+// Inertial measurements.
+pub(crate) mod imu;
 // Text files and errors.
 mod error;
 mod table;

@@ -16,6 +16,7 @@ use super::scan_files;
 use super::scan_list::{self, ScanFile, Selection};
 use super::track::PoseTrack;
 use crate::geometry::Pose3;
+use crate::inertial::Imu;
 use crate::lidar::{PointTiming, Scan};
 
 /// Revolutions per second of the sensor, for recordings without times.
@@ -63,6 +64,8 @@ pub struct Recording {
     pub track: Option<PoseTrack>,
     /// Pose of the lidar on the body whose poses a bag has; `None`: that of its static transforms.
     pub body_from_lidar: Option<Pose3>,
+    /// The inertial sensor, by which poses that are found from the scans are level.
+    pub imu: Option<Imu>,
     /// The bag and the topic of its scans.
     #[cfg(feature = "bags")]
     pub bag: Option<(Arc<Bag>, Arc<str>)>,
@@ -201,6 +204,7 @@ impl Recording {
             skipped: vec![],
             track: None,
             body_from_lidar: None,
+            imu: None,
             #[cfg(feature = "bags")]
             bag: None,
         }

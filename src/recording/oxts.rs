@@ -10,7 +10,7 @@
 
 use std::f64::consts::FRAC_PI_4;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 
@@ -24,15 +24,7 @@ const EARTH_RADIUS_M: f64 = 6_378_137.0;
 /// Reads `oxts/data/*.txt`, ascending, and `calib_imu_to_velo.txt` in the folder of the recording or in the
 /// one above it: poses `world_from_imu`, and `imu_from_lidar` in the place of `cam0_from_lidar`.
 pub fn read(oxts: &Path) -> Result<(Vec<Pose3>, Calibration), RecordingError> {
-    let folder = oxts.join("data");
-    let mut files = Vec::new();
-    for entry in fs::read_dir(&folder).map_err(RecordingError::read(&folder))? {
-        let path = entry.map_err(RecordingError::read(&folder))?.path();
-        if path.extension().is_some_and(|extension| extension == "txt") {
-            files.push(path);
-        }
-    }
-    files.sort();
+    let files = data_files(oxts)?;
     let mut scale = None;
     let mut poses = Vec::with_capacity(files.len());
     for path in &files {
@@ -59,14 +51,31 @@ pub fn read(oxts: &Path) -> Result<(Vec<Pose3>, Calibration), RecordingError> {
     }
     // Relative to the first: coordinates on Earth lose millimetres in single precision.
     let Some(first) = poses.first().copied() else {
-        return Err(RecordingError::NoPoses { path: folder });
+        return Err(RecordingError::NoPoses {
+            path: oxts.join("data"),
+        });
     };
     let origin = Translation3::from(-first.translation.vector);
     poses.iter_mut().for_each(|pose| *pose = origin * *pose);
     Ok((poses, imu_from_lidar(oxts)?))
 }
 
-fn imu_from_lidar(oxts: &Path) -> Result<Calibration, RecordingError> {
+/// The files of the measurements, ascending.
+pub fn data_files(oxts: &Path) -> Result<Vec<PathBuf>, RecordingError> {
+    let folder = oxts.join("data");
+    let mut files = Vec::new();
+    for entry in fs::read_dir(&folder).map_err(RecordingError::read(&folder))? {
+        let path = entry.map_err(RecordingError::read(&folder))?.path();
+        if path.extension().is_some_and(|extension| extension == "txt") {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// Reads the rotation and position of the sensor from `calib_imu_to_velo.txt`.
+pub fn imu_from_lidar(oxts: &Path) -> Result<Calibration, RecordingError> {
     let above = oxts.ancestors().skip(1).take(2);
     let found = (above.map(|folder| folder.join("calib_imu_to_velo.txt"))).find(|p| p.exists());
     let Some(path) = found else {

@@ -18,6 +18,8 @@ pub enum Content {
     Transform,
     /// `tf2_msgs/TFMessage`.
     TransformTree,
+    /// `sensor_msgs/Imu`.
+    Imu,
 }
 
 impl Content {
@@ -29,6 +31,7 @@ impl Content {
             "geometry_msgs/PoseStamped" | "geometry_msgs/PoseWithCovarianceStamped" => Self::Pose,
             "geometry_msgs/TransformStamped" => Self::Transform,
             "tf2_msgs/TFMessage" | "tf/tfMessage" => Self::TransformTree,
+            "sensor_msgs/Imu" => Self::Imu,
             _ => return None,
         })
     }

@@ -1,10 +1,11 @@
 //! Headers, poses and transforms of messages.
 
-use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 
 use super::fields::Fields;
 use super::index::{Content, Serialization};
 use crate::geometry::{FARTHEST_M, Pose3};
+use crate::inertial::ImuSample;
 
 /// `std_msgs/Header`.
 pub struct Header {
@@ -97,6 +98,32 @@ pub fn read_proposal(fields: &mut Fields) -> Result<(FramePose, [f64; 2]), Strin
     }
     let variances = [covariance[0].max(covariance[7]), covariance[35]];
     Ok((pose, variances.map(|it| it.max(0.0).sqrt())))
+}
+
+/// Reads a `sensor_msgs/Imu`, and the name of its frame; `log_s` is the moment of one without a stamp.
+pub fn read_imu(
+    message: &[u8],
+    serialization: Serialization,
+    log_s: f64,
+) -> Result<(ImuSample, String), String> {
+    /// Orientation, its covariance, rates, their covariance, forces.
+    const NUMBERS: usize = 4 + 9 + 3 + 9 + 3;
+    let mut fields = Fields::new(message, serialization)?;
+    let header = Header::read(&mut fields)?;
+    let mut numbers = [0.0; NUMBERS];
+    for number in &mut numbers {
+        *number = fields.f64()?;
+    }
+    let sample = ImuSample {
+        time_s: if header.stamp_s == 0.0 {
+            log_s
+        } else {
+            header.stamp_s
+        },
+        rate_rad_s: Vector3::from_column_slice(&numbers[13..16]),
+        force_m_s2: Vector3::from_column_slice(&numbers[25..28]),
+    };
+    Ok((sample, header.frame))
 }
 
 /// A position or translation, and a quaternion x, y, z, w.

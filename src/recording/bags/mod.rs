@@ -30,6 +30,7 @@ pub use transforms::transform_between;
 
 use super::error::RecordingError;
 use crate::geometry::Pose3;
+use crate::inertial::ImuSample;
 use crate::lidar::Scan;
 use bag_file::BagFile;
 use fields::Fields;
@@ -49,6 +50,8 @@ pub enum TopicKind {
     Scans,
     /// Poses: `nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `PoseWithCovarianceStamped` and `TransformStamped`.
     Poses,
+    /// Inertial measurements: `sensor_msgs/Imu`.
+    Inertial,
 }
 
 impl TopicKind {
@@ -56,6 +59,7 @@ impl TopicKind {
         let contents: &[Content] = match self {
             Self::Scans => &[Content::PointCloud, Content::LivoxCloud],
             Self::Poses => &[Content::Odometry, Content::Pose, Content::Transform],
+            Self::Inertial => &[Content::Imu],
         };
         topic.count > 0
             && topic
@@ -69,6 +73,7 @@ impl TopicKind {
             Self::Poses => {
                 "poses (nav_msgs/Odometry, geometry_msgs/PoseStamped, PoseWithCovarianceStamped or TransformStamped)"
             }
+            Self::Inertial => "inertial measurements (sensor_msgs/Imu)",
         }
     }
 }
@@ -225,6 +230,26 @@ impl Bag {
         let mut poses = self.poses_of(self.topic(TopicKind::Poses, Some(topic))?)?;
         poses.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
         Ok(poses)
+    }
+
+    /// Reads the inertial measurements of a topic by time, and the name of their frame. Forces are as in the messages.
+    ///
+    /// # Errors
+    /// There is no such topic, or a message cannot be decoded.
+    pub fn imu(&self, topic: &str) -> Result<(Vec<ImuSample>, String), RecordingError> {
+        let topic = self.topic(TopicKind::Inertial, Some(topic))?;
+        let mut frame = String::new();
+        let read = |number| {
+            let (sample, name) = self.parse(topic, number, |message, log_s| {
+                message::read_imu(message, topic.serialization, log_s)
+            })?;
+            frame = name;
+            Ok(sample)
+        };
+        let samples: Result<Vec<_>, _> = (0..topic.messages.len()).map(read).collect();
+        let mut samples = samples?;
+        samples.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
+        Ok((samples, frame))
     }
 
     /// Reads the transforms that do not change: those of topics `tf_static`, and of latched ones in ROS 1.
