@@ -28,7 +28,7 @@ use super::loops::Drift;
 use super::planes::{LidarFrame, Plane, ScanPoints, associate};
 use super::pose_graph::{Edge, information};
 use crate::geometry::pose::{exponential, logarithm};
-use crate::geometry::{Pose3, distances_m};
+use crate::geometry::{Pose3, distances_m, pose2_from_pose3, pose3_from_pose2};
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, positive};
 
@@ -181,6 +181,11 @@ fn adjust_unchecked(
             edge.add_to(&mut system, &drive.poses, 1.0);
         }
         hold(&mut system, &drive.poses, held, config);
+        if let Some(levels) = &drive.levels {
+            for (row, pose) in drive.poses.iter().enumerate() {
+                levels.add_to(&mut system, (row, row), pose, 1.0);
+            }
+        }
         let least_m = 0.01 * drive.voxel_m;
         for (kernel_m, found_m) in kernels_m.iter_mut().zip(&residuals.kernels_m) {
             *kernel_m = found_m.max(least_m).min(*kernel_m);
@@ -211,12 +216,20 @@ fn adjust_unchecked(
     }
     if let (Held::First, Some(moved)) = (held, drive.poses.first()) {
         // All move with the first: to move it alone against the others would take many steps.
-        let as_before = first * moved.inverse();
+        let as_before = match &drive.levels {
+            None => first * moved.inverse(),
+            Some(_) => upright(&first) * upright(moved).inverse(),
+        };
         for pose in &mut drive.poses {
             *pose = as_before * *pose;
         }
     }
     Ok(result)
+}
+
+/// The position and the heading of a pose.
+fn upright(pose: &Pose3) -> Pose3 {
+    pose3_from_pose2(&pose2_from_pose3(pose), pose.translation.z)
 }
 
 /// Requires the memory of the equations: all scans of a car that stands see the same planes.

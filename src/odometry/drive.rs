@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use glam::DVec3;
 
+use super::level::Levels;
 use super::sampling::{Sample, TimedPoint, first_per_voxel};
 use super::voxel_map::VoxelMap;
 use crate::geometry::{Pose3, distances_m};
@@ -28,6 +29,8 @@ pub struct Drive {
     pub range_m: f64,
     /// Edge of the voxels of the odometry [m].
     pub voxel_m: f64,
+    /// Directions up that an accelerometer has shown; the map is level then.
+    pub levels: Option<Levels>,
 }
 
 /// Scans in succession, whose poses relative to each other are taken as known.

@@ -327,6 +327,7 @@ mod tests {
             poses,
             range_m: 50.0,
             voxel_m: 0.5,
+            levels: None,
         };
         (drive, maps)
     }

@@ -16,6 +16,7 @@
 //!
 //! ```text
 //! Odometer      pose of each scan, scan by scan
+//! level         with an inertial sensor: tilt from gravity, and the height that follows
 //! loops         submaps of the path, recognized by position and appearance, registered, confirmed by a second loop
 //! pose_graph    poses of the submaps, with a robust kernel for loops; the scans between move along
 //! adjustment    all poses and the planes that the scans have in common
@@ -33,6 +34,7 @@ mod block_system;
 mod config;
 mod drive;
 mod elevation_bias;
+mod level;
 mod loops;
 mod odometer;
 mod path_graph;
@@ -56,7 +58,7 @@ pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{MotionDifference, PoseCheck, PoseFit, PoseMeaning};
 pub use timing::TimingError;
-pub use trajectory::{Trajectory, TrajectoryBuilder, TrajectoryConfig};
+pub use trajectory::{InertialEstimate, Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
 pub(crate) use pose_check::{GivenPoses, check_poses};
 pub(crate) use timing::{TimingComparison, compare_timings};

@@ -104,6 +104,15 @@ impl Edge {
 /// Poses that fit edges best, and the weight of each edge; the first pose stays. `None` if the edges do not
 /// determine the poses.
 pub fn optimize(initial: &[Pose3], edges: &[Edge]) -> Option<(Vec<Pose3>, Vec<f64>)> {
+    optimize_with(initial, edges, |_, _| {})
+}
+
+/// The same with what `constrain` adds to the equations about single poses.
+pub fn optimize_with(
+    initial: &[Pose3],
+    edges: &[Edge],
+    constrain: impl Fn(&mut BlockSystem, &[Pose3]),
+) -> Option<(Vec<Pose3>, Vec<f64>)> {
     /// Normalized square at which a loop has a quarter of its weight: 99.9 % of six degrees of freedom.
     const SCALE: f64 = 22.5;
     /// The kernel narrows by this factor per iteration.
@@ -128,6 +137,7 @@ pub fn optimize(initial: &[Pose3], edges: &[Edge]) -> Option<(Vec<Pose3>, Vec<f6
             }
             edge.add_to(&mut system, &poses, *weight);
         }
+        constrain(&mut system, &poses);
         let steps = system.solve()?;
         let largest = steps.iter().map(|step| step.amax()).fold(0.0, f64::max);
         for (pose, step) in poses.iter_mut().zip(&steps) {

@@ -1,19 +1,23 @@
 //! The trajectory of a whole drive: odometry, loops, and the adjustment of all poses to common surfaces.
 
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::adjustment::{Adjusted, AdjustmentConfig, Held, adjust};
 use super::alignment::median;
 use super::anchors::{self, NotInMap, Placed, PlacementError};
+use super::block_system::BlockSystem;
 use super::config::{LoopConfig, OdometryConfig};
 use super::drive::{Drive, POINT_BYTES, SHORTER, Submap};
+use super::level::{Levelled, level};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
 use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
-use super::pose_graph::{Edge, optimize};
+use super::pose_graph::{Edge, optimize_with};
 use super::sampling::{Sample, sensor_range};
 use crate::geometry::{Pose3, TriangleMesh};
+use crate::inertial::{Imu, ImuCalibration, ImuRejection, MeasuredTurn};
 use crate::lidar::{PERIOD_S, Scan, interval_s};
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, nested};
@@ -51,8 +55,8 @@ impl Validate for TrajectoryConfig {
     }
 }
 
-/// Poses of a drive, in the lidar frame of its first scan, that of the given poses, or that of the map in which it was
-/// found.
+/// Poses of a drive, in the lidar frame of its first scan, turned so that z points up where an inertial sensor shows it,
+/// that of the given poses, or that of the map in which it was found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trajectory {
     /// `p_map = map_from_lidar * p_lidar` of each scan.
@@ -63,6 +67,19 @@ pub struct Trajectory {
     pub loops: Vec<Loop>,
     /// What the adjustment of all poses has found; `None` without one.
     pub adjusted: Option<Adjusted>,
+    /// What was found about the inertial sensor by which the poses are level; `None` without one, or where it was left out.
+    pub inertial: Option<InertialEstimate>,
+}
+
+/// What was found about an inertial sensor.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct InertialEstimate {
+    /// Its axes, clock and rate bias.
+    pub calibration: ImuCalibration,
+    /// Mean bias of its forces, along its axes [m/s²].
+    pub force_bias_m_s2: Vector3<f64>,
+    /// Standard deviation of the tilt of the drive as a whole [rad].
+    pub tilt_sigma_rad: f64,
 }
 
 /// Finds the trajectory of a drive, scan by scan.
@@ -75,6 +92,9 @@ pub struct TrajectoryBuilder {
     ranges_m: Vec<f32>,
     given: Vec<Pose3>,
     time_s: Option<f64>,
+    /// Time of the first scan [s].
+    first_s: Option<f64>,
+    imu: Option<Imu>,
     /// Number of points of all samples.
     points: usize,
     memory_budget: MemoryBudget,
@@ -95,6 +115,8 @@ impl TrajectoryBuilder {
             ranges_m: vec![],
             given: vec![],
             time_s: None,
+            first_s: None,
+            imu: None,
             points: 0,
             memory_budget: MemoryBudget::default(),
         })
@@ -105,6 +127,16 @@ impl TrajectoryBuilder {
     pub fn with_memory_budget(self, memory_budget: MemoryBudget) -> Self {
         Self {
             memory_budget,
+            ..self
+        }
+    }
+
+    /// Makes the poses level by an inertial sensor, whose times are of the same clock as those of the scans, but for an
+    /// offset. One that does not fit the scans is left out with a warning; given poses are not changed by it.
+    #[must_use]
+    pub fn with_imu(self, imu: Imu) -> Self {
+        Self {
+            imu: Some(imu),
             ..self
         }
     }
@@ -156,6 +188,9 @@ impl TrajectoryBuilder {
         self.samples.push(sample);
         self.ranges_m.extend(range_m.map(|range_m| range_m as f32));
         self.time_s = scan.time_s;
+        if self.samples.len() == 1 {
+            self.first_s = scan.time_s;
+        }
         self.memory_budget.require(
             "the points of all scans",
             self.points as f64 * POINT_BYTES,
@@ -167,14 +202,22 @@ impl TrajectoryBuilder {
     ///
     /// # Errors
     /// Memory does not suffice.
-    pub fn finish(self) -> Result<Trajectory, MemoryError> {
+    pub fn finish(mut self) -> Result<Trajectory, MemoryError> {
         let given = self.given.clone();
         let is_given = !given.is_empty();
         let budget = self.memory_budget;
+        let imu = self.imu.take().filter(|_| !is_given);
+        let first_s = self.first_s;
         let (config, mut trajectory, drive) = self.into_drive();
         let Some(mut drive) = drive else {
             return Ok(trajectory);
         };
+        if let Some(imu) = imu {
+            match make_level(&mut drive, &mut trajectory.odometry, first_s, &imu) {
+                Ok(found) => trajectory.inertial = Some(found),
+                Err(rejection) => tracing::warn!("the inertial sensor is left out: {rejection}"),
+            }
+        }
         if config.loops && !is_given {
             trajectory.loops = close_loops(&mut drive, &trajectory.odometry, &config.loop_closure);
         }
@@ -238,15 +281,62 @@ impl TrajectoryBuilder {
             poses: poses.clone(),
             range_m,
             voxel_m: self.config.odometry.voxel_share * range_m,
+            levels: None,
         });
         let trajectory = Trajectory {
             poses,
             odometry: self.estimates,
             loops: vec![],
             adjusted: None,
+            inertial: None,
         };
         (self.config, trajectory, drive)
     }
+}
+
+/// Turns the poses of a drive so that z points up along all of it, and those of its odometry as a whole.
+fn make_level(
+    drive: &mut Drive,
+    odometry: &mut [OdometryEstimate],
+    first_s: Option<f64>,
+    imu: &Imu,
+) -> Result<InertialEstimate, ImuRejection> {
+    let first_s = first_s.ok_or(ImuRejection::NoTimes)?;
+    let times_s: Vec<f64> = drive
+        .times_s
+        .iter()
+        .map(|time_s| first_s + time_s)
+        .collect();
+    let is_known = |row: &usize| {
+        let step = &odometry[*row];
+        step.state == StepState::Registered && step.degenerate_directions.is_empty()
+    };
+    let turns: Vec<MeasuredTurn> = (1..times_s.len())
+        .filter(is_known)
+        .map(|row| MeasuredTurn {
+            from_s: times_s[row - 1],
+            to_s: times_s[row],
+            turn: odometry[row].previous_from_current.rotation,
+        })
+        .collect();
+    let calibration = ImuCalibration::estimate(imu, &turns)?;
+    let Levelled {
+        poses,
+        levels,
+        force_bias_m_s2,
+        sigma_rad,
+    } = level(&drive.poses, &times_s, &imu.samples, &calibration)?;
+    let as_a_whole = poses[0] * drive.poses[0].inverse();
+    for estimate in odometry {
+        estimate.odom_from_lidar = as_a_whole * estimate.odom_from_lidar;
+    }
+    drive.poses = poses;
+    drive.levels = Some(levels);
+    Ok(InertialEstimate {
+        calibration,
+        force_bias_m_s2,
+        tilt_sigma_rad: sigma_rad,
+    })
 }
 
 /// Times of scans since the first [s].
@@ -308,7 +398,11 @@ fn close(
         .collect();
     let centers: Vec<Pose3> = maps.iter().map(|map| drive.poses[map.center]).collect();
     let optimized = (used.iter().any(Option::is_some))
-        .then(|| optimize(&centers, &edges))
+        .then(|| {
+            optimize_with(&centers, &edges, |system, poses| {
+                keep_level(drive, maps, system, poses)
+            })
+        })
         .flatten();
     let mut weights = optimized
         .iter()
@@ -331,6 +425,16 @@ fn close(
         move_along(&mut drive.poses, maps, &centers, &optimized);
     }
     result
+}
+
+/// Adds the directions up of the scans of submaps, where they are known, to the equations of their poses.
+fn keep_level(drive: &Drive, maps: &[Submap], system: &mut BlockSystem, poses: &[Pose3]) {
+    let Some(levels) = &drive.levels else {
+        return;
+    };
+    for (place, (map, pose)) in maps.iter().zip(poses).enumerate() {
+        levels.add_to(system, (place, map.center), pose, map.rows.len() as f64);
+    }
 }
 
 #[cfg(test)]

@@ -1,11 +1,14 @@
 //! Laws of trajectories of whole drives, on scans of a drawn world.
 
-use nalgebra::Vector3;
+use std::sync::Arc;
+
+use nalgebra::{UnitQuaternion, Vector3};
 use rand::{SeedableRng as _, rngs::StdRng};
 use rand_distr::{Distribution as _, StandardNormal};
 
 use super::super::tests::{World, drive};
 use super::*;
+use crate::inertial::{GRAVITY_M_S2, ImuSample, ImuSamples};
 
 /// A scan of the world every 0.25 s from a time on.
 fn scans(world: &World, first_s: f64, count: usize) -> (Vec<Scan>, Vec<Pose3>) {
@@ -27,6 +30,31 @@ fn noise(rng: &mut StdRng, shift_m: f64, turn_deg: f64) -> Pose3 {
         })
     };
     Pose3::new(vector(shift_m), vector(turn_deg.to_radians()))
+}
+
+/// Adds scans with the estimates of an odometry that drifts in each step; returns its last pose.
+fn add_drifting(
+    builder: &mut TrajectoryBuilder,
+    scans: &[Scan],
+    truth: &[Pose3],
+    drift: Pose3,
+) -> Pose3 {
+    let mut drifted = Pose3::identity();
+    for (row, scan) in scans.iter().enumerate() {
+        builder.keep(scan).unwrap();
+        let motion = match row {
+            0 => Pose3::identity(),
+            row => truth[row - 1].inverse() * truth[row] * drift,
+        };
+        drifted *= motion;
+        builder.estimates.push(OdometryEstimate {
+            odom_from_lidar: drifted,
+            previous_from_current: motion,
+            state: StepState::Registered,
+            ..OdometryEstimate::first(0.25)
+        });
+    }
+    drifted
 }
 
 fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
@@ -70,21 +98,7 @@ fn a_round_closes_its_loop_and_takes_the_drift_away() {
         Vector3::new(0.01, 0.0, 0.005),
         Vector3::new(0.0, 0.0, 0.0006),
     );
-    let mut drifted = Pose3::identity();
-    for (row, scan) in scans.iter().enumerate() {
-        builder.keep(scan).unwrap();
-        let motion = match row {
-            0 => Pose3::identity(),
-            row => truth[row - 1].inverse() * truth[row] * drift,
-        };
-        drifted *= motion;
-        builder.estimates.push(OdometryEstimate {
-            odom_from_lidar: drifted,
-            previous_from_current: motion,
-            state: StepState::Registered,
-            ..OdometryEstimate::first(0.25)
-        });
-    }
+    let drifted = add_drifting(&mut builder, &scans, &truth, drift);
     let mut strict = builder.clone();
     strict.config.loop_closure.min_common_share = 1.0;
     assert!(strict.finish().unwrap().loops.is_empty());
@@ -113,6 +127,7 @@ fn a_loop_that_no_other_confirms_does_not_move_the_poses() {
         poses: poses.clone(),
         range_m: 50.0,
         voxel_m: 0.5,
+        levels: None,
     };
     let maps = drive.submaps(5.0);
     let edges = odometry_edges(&drive, &maps, &vec![OdometryEstimate::first(0.1); 12]);
@@ -238,4 +253,69 @@ fn the_bias_of_the_elevations_follows_from_surfaces_seen_from_far_and_near() {
         assert!((found.deg / bias_deg - 1.0).abs() < 0.4, "{found:?}");
         assert!(found.deg.abs() > 4.0 * found.sigma_deg, "{found:?}");
     }
+}
+
+/// Measurements of a sensor with the axes of the lidar on the drawn drive, in a world that leans by a rotation.
+fn inertial(leaning: UnitQuaternion<f64>, seconds: usize, offset_s: f64) -> Imu {
+    const PERIOD_S: f64 = 0.01;
+    let at = |row: i32| {
+        let pose = drive(PERIOD_S * f64::from(row));
+        Pose3::from_parts(
+            (leaning * pose.translation.vector).into(),
+            leaning * pose.rotation,
+        )
+    };
+    let rows = -50..100 * seconds as i32;
+    let samples = rows.map(|row| {
+        let [before, here, after] = [row - 1, row, row + 1].map(at);
+        let [p, q, r] = [before, here, after].map(|pose| pose.translation.vector);
+        let force = (r - q * 2.0 + p) / PERIOD_S.powi(2) + Vector3::z() * GRAVITY_M_S2;
+        let turn = (before.rotation.inverse() * after.rotation).scaled_axis();
+        ImuSample {
+            time_s: PERIOD_S * f64::from(row) + offset_s,
+            rate_rad_s: turn / (2.0 * PERIOD_S) + Vector3::new(0.01, -0.02, 0.01),
+            force_m_s2: here.rotation.inverse() * force + Vector3::new(0.1, -0.05, 0.02),
+        }
+    });
+    Imu {
+        samples: Arc::new(ImuSamples::new(samples.collect()).unwrap()),
+        lidar_from_imu: None,
+    }
+}
+
+#[test]
+fn with_an_inertial_sensor_a_drive_is_level_after_loops_and_adjustment() {
+    let (scans, truth) = scans(&World::around_a_block(), 0.0, 120);
+    let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default()).unwrap();
+    let drift = Pose3::rotation(Vector3::new(0.0003, 0.0006, 0.0));
+    add_drifting(&mut builder, &scans, &truth, drift);
+    let leaning = UnitQuaternion::from_euler_angles(0.05, -0.03, 0.0);
+    let tilt_deg = |poses: &[Pose3]| {
+        let of_row = |row: usize| {
+            let up = (leaning * truth[row].rotation).inverse() * Vector3::z();
+            let found = poses[row].rotation.inverse() * Vector3::z();
+            up.angle(&found).to_degrees()
+        };
+        (0..poses.len()).map(of_row).fold(0.0, f64::max)
+    };
+    let without = builder.clone().finish().unwrap();
+    let with = (builder.clone().with_imu(inertial(leaning, 32, 0.03)))
+        .finish()
+        .unwrap();
+    let found = with.inertial.unwrap();
+    let tilts = (tilt_deg(&without.poses), tilt_deg(&with.poses));
+    eprintln!("{tilts:?} deg, {found:?}");
+    assert!(tilts.0 > 2.5 && tilts.1 < 0.15, "{tilts:?}");
+    assert!(
+        (found.calibration.offset_s - 0.03).abs() < 0.01,
+        "{found:?}"
+    );
+    assert!(with.poses[0].translation.vector.norm() < 1e-6);
+    assert!(crate::geometry::yaw(&with.poses[0]).abs() < 0.005);
+    // One whose clock is another leaves everything as it is.
+    let other = builder
+        .with_imu(inertial(leaning, 32, 1e6))
+        .finish()
+        .unwrap();
+    assert_eq!(other, without);
 }
