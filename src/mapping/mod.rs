@@ -20,7 +20,7 @@ use std::sync::Arc;
 pub use error::MappingError;
 pub use lost_path::LostPath;
 pub use pose_report::{PoseReport, Tilt};
-pub use trajectory::{LoopCounts, TrajectorySummary};
+pub use trajectory::{InertialSummary, LoopCounts, TrajectorySummary};
 
 pub(crate) use pose_search::PoseSearch;
 pub(crate) use poses::{check_path, checked, key_frames, poses_of, with_given_poses};

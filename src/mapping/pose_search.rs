@@ -5,6 +5,7 @@ use super::lost_path::LostPath;
 use super::poses::check_path;
 use super::trajectory::{OnEvent, each_scan, find_poses};
 use crate::geometry::{Pose3, StampedPose};
+use crate::inertial::Imu;
 use crate::localization::{LocalizerConfig, SecondDrive, SecondDriveError, Tracker, TrackerConfig};
 use crate::map::{Map, MapConfig, PoseSource};
 use crate::memory::MemoryBudget;
@@ -54,6 +55,12 @@ impl<'a> PoseSearch<'a> {
         self.recording.track.is_some()
     }
 
+    /// The inertial sensor by which the poses are level; `None` where others show the direction up.
+    pub fn imu(&self) -> Option<&Imu> {
+        let is_used = self.older.is_none() && !self.is_given();
+        (self.recording.timed_imu()).filter(|_| is_used)
+    }
+
     /// The stage of the build.
     pub fn name(&self) -> &'static str {
         match (self.older, self.is_given()) {
@@ -77,6 +84,7 @@ impl<'a> PoseSearch<'a> {
                 let found = find_poses(
                     &self.frames,
                     self.is_given(),
+                    self.imu(),
                     &settings,
                     memory_budget,
                     on_event,

@@ -5,11 +5,13 @@ use std::ops::ControlFlow;
 use serde::{Deserialize, Serialize};
 
 use super::error::MappingError;
+use crate::inertial::Imu;
 use crate::lidar::Scan;
 use crate::map::BuildEvent;
 use crate::memory::MemoryBudget;
 use crate::odometry::{
-    ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
+    ElevationBias, InertialEstimate, LoopVerdict, StepState, Trajectory, TrajectoryBuilder,
+    TrajectoryConfig,
 };
 use crate::recording::Frame;
 
@@ -19,18 +21,23 @@ pub const ADJUSTMENT: &str = "loops and adjustment";
 /// Called for every event; the work ends soon after it returns `Break`.
 pub(super) type OnEvent<'a> = &'a dyn Fn(BuildEvent) -> ControlFlow<()>;
 
-/// Finds the poses of frames from their scans, or polishes those that are given.
+/// Finds the poses of frames from their scans, level by an inertial sensor where there is one, or polishes those that are
+/// given.
 ///
 /// Its events are the stage `"odometry"` or `"polish"`, every scan, and the stage [`ADJUSTMENT`].
 pub fn find_poses(
     frames: &[Frame],
     are_given: bool,
+    imu: Option<&Imu>,
     config: &TrajectoryConfig,
     memory_budget: MemoryBudget,
     on_event: OnEvent,
 ) -> Result<Trajectory, MappingError> {
     let builder = TrajectoryBuilder::new(config.clone())?;
     let mut builder = builder.with_memory_budget(memory_budget);
+    if let Some(imu) = imu {
+        builder = builder.with_imu(imu.clone());
+    }
     let name = if are_given { "polish" } else { "odometry" };
     each_scan(name, frames, on_event, |frame, scan| {
         match frame.map_from_lidar {
@@ -87,6 +94,45 @@ pub struct TrajectorySummary {
     pub elevation_bias: Option<ElevationBias>,
     /// Largest change of a position by loops and adjustment [m].
     pub largest_change_m: f64,
+    /// The inertial sensor by which the poses are level; absent without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub inertial: Option<InertialSummary>,
+}
+
+/// What was found about an inertial sensor.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+pub struct InertialSummary {
+    /// Roll, pitch and yaw of its axes in the lidar frame [deg].
+    pub lidar_from_imu_deg: [f64; 3],
+    /// Standard deviation of this rotation about its least certain axis, 0 where it is given [deg].
+    pub axes_sigma_deg: f64,
+    /// Time of its clock at the moment 0 of that of the scans [s].
+    pub time_offset_s: f64,
+    /// Bias of the angular rates [deg/s].
+    pub rate_bias_deg_per_s: [f64; 3],
+    /// Bias of the forces [m/s²].
+    pub force_bias_m_per_s2: [f64; 3],
+    /// Root mean square of the difference between its rates and those of the scans [deg/s].
+    pub residual_deg_per_s: f64,
+    /// Standard deviation of the tilt of the drive as a whole [deg].
+    pub tilt_sigma_deg: f64,
+}
+
+impl From<&InertialEstimate> for InertialSummary {
+    fn from(found: &InertialEstimate) -> Self {
+        let calibration = &found.calibration;
+        let (roll, pitch, yaw) = calibration.lidar_from_imu.euler_angles();
+        Self {
+            lidar_from_imu_deg: [roll, pitch, yaw].map(f64::to_degrees),
+            axes_sigma_deg: calibration.axes_sigma_rad.to_degrees(),
+            time_offset_s: calibration.offset_s,
+            rate_bias_deg_per_s: calibration.rate_bias_rad_s.map(f64::to_degrees).into(),
+            force_bias_m_per_s2: found.force_bias_m_s2.into(),
+            residual_deg_per_s: calibration.residual_rad_s.to_degrees(),
+            tilt_sigma_deg: found.tilt_sigma_rad.to_degrees(),
+        }
+    }
 }
 
 /// Numbers of loops.
@@ -152,6 +198,7 @@ impl TrajectorySummary {
             largest_change_m: (positions().zip(steps))
                 .map(|(found, step)| (found - step.odom_from_lidar.translation.vector).norm())
                 .fold(0.0, f64::max),
+            inertial: trajectory.inertial.as_ref().map(InertialSummary::from),
         }
     }
 }

@@ -35,6 +35,10 @@ pub struct OdometryArgs {
     /// Calibration of the camera whose poses these are; sets the key `calib_file`.
     #[arg(long = "calib", value_name = "FILE")]
     pub calib_file: Option<PathBuf>,
+
+    /// Inertial sensor that makes the poses level: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
+    #[arg(long = "imu", value_name = "FILE")]
+    pub imu_file: Option<PathBuf>,
 }
 
 /// Finds the poses of the recording that a configuration names; returns what to print.
@@ -45,11 +49,14 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     let (recording, sensor) = open(&mut resolved)?;
     let frames = recording.dense_frames();
     let is_given = recording.track.is_some();
+    config.inertial.warn_unless(!is_given);
+    let imu = recording.timed_imu().filter(|_| !is_given);
     let name = if is_given { "polish" } else { "odometry" };
     let found = trajectory::find(name, frames.len(), context, |on_event| {
         find_poses(
             &frames,
             is_given,
+            imu,
             &config.trajectory,
             memory::budget(),
             on_event,
@@ -90,6 +97,7 @@ fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> 
     ];
     names.extend(config.output.plots.then_some("path.png"));
     let mut inputs = RecordingInputs::new(&config.recording, &config.given_poses).files();
+    inputs.extend(config.inertial.files(&config.recording));
     input::require(&inputs)?;
     inputs.extend(context.input());
     let outputs = Outputs {
@@ -106,7 +114,7 @@ fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> 
 /// Opens the recording, with the poses to polish if there are any.
 fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Sensor)> {
     let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
-    let mut recording = inputs.open()?;
+    let mut recording = config.inertial.open(inputs.open()?)?;
     if let Some(path) = &config.given_poses.pose_file {
         let track = inputs.track(path, &recording)?;
         recording = recording.with_poses(track)?;

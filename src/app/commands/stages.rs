@@ -7,7 +7,8 @@ use anyhow::{Context as _, Result};
 use crate::app::run::input::is_bag;
 use crate::app::run::{Context, input, memory};
 use crate::app::settings::{
-    MapInputConfig, MotionSourceConfig, OdometrySource, PoseInputConfig, RecordingConfig,
+    InertialConfig, MapInputConfig, MotionSourceConfig, OdometrySource, PoseInputConfig,
+    RecordingConfig,
 };
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::recording::{PoseTrack, Recording, is_topic};
@@ -63,6 +64,33 @@ impl<'a> RecordingInputs<'a> {
     /// Reads poses of the recording from a file, or from a topic of its bag.
     pub fn track(&self, path: &Path, recording: &Recording) -> Result<PoseTrack> {
         Ok(recording.read_track(path, self.poses.calib_file.as_deref())?)
+    }
+}
+
+impl InertialConfig {
+    /// The file of the measurements, which is not a topic of the bag, and its key.
+    pub fn files(&self, recording: &RecordingConfig) -> Option<(&'static str, &Path)> {
+        let path = self.imu_file.as_deref()?;
+        let is_file = !(is_topic(path) && is_bag(&recording.scan_folder));
+        is_file.then_some(("imu_file", path))
+    }
+
+    /// Warns where a sensor is named that poses of another origin leave without use.
+    pub fn warn_unless(&self, is_used: bool) {
+        if self.imu_file.is_some() && !is_used {
+            tracing::warn!(
+                "the inertial sensor is not used: it makes poses level that are found from the scans alone"
+            );
+        }
+    }
+
+    /// The recording with its inertial sensor, where one is named.
+    pub fn open(&self, recording: Recording) -> Result<Recording> {
+        let Some(path) = &self.imu_file else {
+            return Ok(recording);
+        };
+        let imu = recording.read_imu(path, self.lidar_from_imu())?;
+        Ok(recording.with_imu(imu))
     }
 }
 

@@ -112,6 +112,21 @@ pub fn rows(summary: &TrajectorySummary) -> Vec<(&'static str, String)> {
             ),
         ));
     }
+    if let Some(inertial) = &summary.inertial {
+        let [roll, pitch, yaw] = inertial.lidar_from_imu_deg;
+        rows.push((
+            "axes of the inertial sensor",
+            format!("roll {roll:.1}, pitch {pitch:.1}, yaw {yaw:.1} deg"),
+        ));
+        rows.push((
+            "offset of its clock",
+            format!("{:.1} ms", 1e3 * inertial.time_offset_s),
+        ));
+        rows.push((
+            "direction up",
+            format!("standard deviation {:.3} deg", inertial.tilt_sigma_deg),
+        ));
+    }
     rows.push((
         "largest change",
         format!("{:.3} m", summary.largest_change_m),

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
+use nalgebra::UnitQuaternion;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -77,6 +78,36 @@ impl Validate for PoseInputConfig {
             format!("{numbers:?}"),
             "x, y, z must be within 1000 m, and roll, pitch, yaw within 360 degrees",
         )
+    }
+}
+
+/// The inertial sensor of a recording, by which poses that are found from the scans are level.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct InertialConfig {
+    /// Its measurements: a table of times, angular rates and forces, a folder `oxts`, or a topic of the bag; `None`: no
+    /// sensor.
+    pub imu_file: Option<PathBuf>,
+    /// Roll, pitch, yaw [deg] of its axes in the lidar frame; `None`: from the transforms of the bag or the calibration of
+    /// `oxts`, else estimated.
+    pub lidar_from_imu: Option<[f64; 3]>,
+}
+
+impl InertialConfig {
+    /// `lidar_from_imu` as a rotation.
+    pub fn lidar_from_imu(&self) -> Option<UnitQuaternion<f64>> {
+        let [roll, pitch, yaw] = self.lidar_from_imu?;
+        Some(pose_from_degrees([0.0, 0.0, 0.0, roll, pitch, yaw]).rotation)
+    }
+}
+
+impl Validate for InertialConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        optional_path("imu_file", self.imu_file.as_deref())?;
+        for deg in self.lidar_from_imu.iter().flatten() {
+            in_range("lidar_from_imu", *deg, -360.0..=360.0)?;
+        }
+        Ok(())
     }
 }
 

@@ -6,7 +6,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::blocks::{OutputConfig, PoseInputConfig, RecordingConfig, optional_path, require_path};
+use super::blocks::{
+    InertialConfig, OutputConfig, PoseInputConfig, RecordingConfig, optional_path, require_path,
+};
 use crate::map::{MapConfig, PoseSource};
 use crate::validation::{InvalidValue, Validate, nested, require};
 
@@ -18,6 +20,8 @@ pub struct BuildMapConfig {
     pub recording: RecordingConfig,
     /// Its poses, where they are given.
     pub given_poses: PoseInputConfig,
+    /// Its inertial sensor, where it is used.
+    pub inertial: InertialConfig,
     /// Output path of the map.
     #[default("results/map.ply".into())]
     pub mesh_file: PathBuf,
@@ -40,6 +44,7 @@ impl Validate for BuildMapConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("recording", &self.recording)?;
         nested("given_poses", &self.given_poses)?;
+        nested("inertial", &self.inertial)?;
         optional_path("cloud_file", self.cloud_file.as_deref())?;
         optional_path("truth_mesh", self.truth_mesh.as_deref())?;
         optional_path("onto", self.onto.as_deref())?;

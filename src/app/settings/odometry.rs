@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::blocks::{OutputConfig, PoseInputConfig, RecordingConfig, require_path};
+use super::blocks::{InertialConfig, OutputConfig, PoseInputConfig, RecordingConfig, require_path};
 use crate::odometry::TrajectoryConfig;
 use crate::sensor::MotionCompensation;
 use crate::validation::{InvalidValue, Validate, nested, positive};
@@ -19,6 +19,8 @@ pub struct OdometryCommandConfig {
     pub recording: RecordingConfig,
     /// Poses to polish; without any, poses are found from the scans alone.
     pub given_poses: PoseInputConfig,
+    /// Its inertial sensor, where it is used.
+    pub inertial: InertialConfig,
     /// Folder of the poses, the report and the picture.
     #[default("results/odometry".into())]
     pub output_folder: PathBuf,
@@ -38,6 +40,7 @@ impl Validate for OdometryCommandConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("recording", &self.recording)?;
         nested("given_poses", &self.given_poses)?;
+        nested("inertial", &self.inertial)?;
         require_path("output_folder", &self.output_folder)?;
         positive("max_step_m", self.max_step_m)?;
         nested("trajectory", &self.trajectory)

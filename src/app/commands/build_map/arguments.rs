@@ -28,6 +28,10 @@ pub struct BuildMapArgs {
     #[arg(long = "calib", value_name = "FILE")]
     pub calib_file: Option<PathBuf>,
 
+    /// Inertial sensor that makes the poses level: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
+    #[arg(long = "imu", value_name = "FILE")]
+    pub imu_file: Option<PathBuf>,
+
     /// Map to which the recording is added: it is localized there, and what has changed is replaced. Sets the key `onto`.
     #[arg(long, value_name = "MAP")]
     pub onto: Option<PathBuf>,

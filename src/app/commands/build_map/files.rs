@@ -25,6 +25,7 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
     let mut inputs = Vec::new();
     if config.cloud_file.is_none() {
         inputs.extend(RecordingInputs::new(&config.recording, &config.given_poses).files());
+        inputs.extend(config.inertial.files(&config.recording));
     }
     let optional = [
         ("cloud_file", &config.cloud_file),

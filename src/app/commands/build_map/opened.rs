@@ -52,6 +52,8 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let recording = poses::open(&config, older.as_ref())?;
     let (mut sequence, sensor) = poses::check(recording, &mut config)?;
     let mut trajectory = None;
+    let is_level = sequence.track.is_none() && older.is_none();
+    config.inertial.warn_unless(is_level);
     if PoseSearch::is_needed(&sequence, &config.map) {
         let has_times = sequence.has_times;
         let search = PoseSearch::new(sequence, &sensor, older_map.as_ref(), &config.map);

@@ -29,7 +29,7 @@ const SUMMARY: &str = "# ";
 /// Opens the recording with the poses that are given, if they are used.
 pub fn open(config: &BuildMapConfig, older: Option<&OlderMap>) -> Result<Recording> {
     let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
-    let mut recording = inputs.open()?;
+    let mut recording = config.inertial.open(inputs.open()?)?;
     let is_found = config.map.poses == PoseSource::Auto && older.is_some();
     if let Some(older) = older.filter(|_| is_found) {
         let map = older.file.display();
@@ -134,6 +134,9 @@ fn inputs(search: &PoseSearch, localized_by: &str) -> Result<String> {
             "{source} {bytes} {} {:?} {} {} {given:?}",
             frame.time_s, frame.timing, frame.is_timed, frame.elevation_bias_rad
         ));
+    }
+    if let Some(imu) = search.imu() {
+        parts.push(format!("{:?} {:?}", imu.lidar_from_imu, imu.samples.rows()));
     }
     Ok(hash_of_texts(&parts))
 }
