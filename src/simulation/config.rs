@@ -8,6 +8,7 @@ use smart_default::SmartDefault;
 use super::centreline::PathSegment;
 use super::ego_motion::MotionConfig;
 use super::given_poses::GivenPosesConfig;
+use super::inertial::SimulatedImuConfig;
 use super::odometry::SimulatedOdometryConfig;
 use super::scanner::ScannerConfig;
 use super::street_config::StreetConfig;
@@ -53,6 +54,8 @@ pub struct SimulationConfig {
     pub odometry: SimulatedOdometryConfig,
     /// Errors of the poses that the drive comes with, to build a map with; without errors they are the true ones.
     pub given_poses: GivenPosesConfig,
+    /// The inertial sensor.
+    pub imu: SimulatedImuConfig,
 }
 
 impl SimulationConfig {
@@ -79,7 +82,8 @@ impl Validate for SimulationConfig {
         nested("traffic", &self.traffic)?;
         nested("scanner", &self.scanner)?;
         nested("odometry", &self.odometry)?;
-        nested("given_poses", &self.given_poses)
+        nested("given_poses", &self.given_poses)?;
+        nested("imu", &self.imu)
     }
 }
 

@@ -4,6 +4,7 @@
 //! velodyne/000000.bin ...         points
 //! labels/000000.label ...         SemanticKITTI class of each point
 //! calib.txt times.txt odometry.txt
+//! imu.csv                         only where the configuration has an inertial sensor
 //! given_poses.txt poses_in_map.txt    only where the configuration gives poses with errors
 //! poses.txt                       written last
 //! ```
@@ -20,6 +21,7 @@ use super::{Simulation, calibration};
 use crate::files::write_atomically;
 use crate::geometry::Pose3;
 use crate::recording::MapFrame;
+use crate::recording::imu::write_table;
 use crate::recording::poses::{write_kitti, write_times};
 use crate::recording::velodyne;
 
@@ -32,6 +34,7 @@ pub const POSES_IN_MAP_FILE: &str = "poses_in_map.txt";
 
 const CALIBRATION_FILE: &str = "calib.txt";
 const TIMES_FILE: &str = "times.txt";
+const IMU_FILE: &str = "imu.csv";
 
 /// A file of a drive that cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -68,7 +71,9 @@ impl Simulation {
     /// Paths of all files of the drive in a folder.
     pub fn files_in(&self, folder: &Path) -> Vec<PathBuf> {
         let poses = self.tables().into_iter().map(|(name, _)| name);
-        let tables = [CALIBRATION_FILE, TIMES_FILE].into_iter().chain(poses);
+        let imu = self.config.imu.grade.map(|_| IMU_FILE);
+        let tables = [CALIBRATION_FILE, TIMES_FILE].into_iter().chain(imu);
+        let tables = tables.chain(poses);
         let scans = (0..self.frames()).flat_map(|frame| scan_files(folder, frame));
         tables.map(|name| folder.join(name)).chain(scans).collect()
     }
@@ -123,6 +128,10 @@ impl Simulation {
             frame.calibration.write(file)
         })?;
         write(&folder.join(TIMES_FILE), |file| write_times(file, &times_s))?;
+        if self.config.imu.grade.is_some() {
+            let samples = self.imu_samples();
+            write(&folder.join(IMU_FILE), |file| write_table(file, &samples))?;
+        }
         for (name, poses) in self.tables() {
             let poses = poses(self);
             write(&folder.join(name), |file| {

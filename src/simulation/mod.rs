@@ -34,11 +34,14 @@ mod config;
 pub mod drive_files;
 mod ego_motion;
 mod given_poses;
+mod inertial;
 mod odometry;
 mod scanner;
 mod scenes;
 mod traffic;
 
+#[cfg(test)]
+mod inertial_tests;
 #[cfg(test)]
 mod tests;
 
@@ -50,6 +53,7 @@ pub use config::{SimulationConfig, SimulationError};
 pub use ego_motion::{EgoMotion, MotionConfig, SCAN_PERIOD_S};
 pub use given_poses::GivenPosesConfig;
 pub use ground::{GroundField, GroundSample, GroundZone};
+pub use inertial::{ImuGrade, SimulatedImuConfig};
 pub use odometry::SimulatedOdometryConfig;
 pub use scanner::{LabelledScan, ScannerConfig};
 pub use scenes::{crest_scene, ground_scenes, kerb_scene, slope_scene};
@@ -59,6 +63,7 @@ pub use structure::Structure;
 pub use traffic::TrafficConfig;
 
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
+use crate::inertial::ImuSample;
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::random::Generator;
 use crate::recording::Calibration;
@@ -162,6 +167,14 @@ impl Simulation {
             self.config.drive.into(),
         );
         drifting_odometry(&poses, &self.config.odometry, &mut rng)
+    }
+
+    /// What the inertial sensor of the drive has measured; nothing without one.
+    pub fn imu_samples(&self) -> Vec<ImuSample> {
+        let mut rng = stream(self.config.seed, Purpose::Imu, self.config.drive.into());
+        let duration_s = time_s(self.frames().saturating_sub(1));
+        let pose_at = |time_s| self.world_from_lidar(time_s);
+        inertial::imu_samples(&self.config.imu, duration_s, pose_at, &mut rng)
     }
 
     /// The poses that the drive comes with, world frame.

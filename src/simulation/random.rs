@@ -20,6 +20,7 @@ pub(super) enum Purpose {
     Square = 11,
     Change = 12,
     GivenPoses = 13,
+    Imu = 14,
 }
 
 /// Stream number `index` of a purpose: the only source of generators in this module.
