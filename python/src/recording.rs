@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use anyhow::anyhow;
 use fpmcl::geometry::{Pose3, pose_from_degrees};
 use fpmcl::lidar;
-use fpmcl::recording::{self, Selection};
+use fpmcl::recording::{self, Layout, Selection};
 use fpmcl::sensor::{self, MotionCompensation, SensorConfig};
 use fpmcl::validation::Validate as _;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayDyn};
@@ -268,12 +268,14 @@ pub fn without_poses() -> PyErr {
     ))
 }
 
-/// Opens a recording: a folder of scans (KITTI odometry, KITTI raw, .bin, .pcd, .ply, .npy) or a bag (MCAP, rosbag2, ROS 1).
+/// Opens a recording: a folder of scans (.bin, .pcd, .ply, .npy), a data set such as KITTI, MulRan or nuScenes, or a bag (MCAP, rosbag2,
+/// ROS 1).
 ///
 /// ``poses``: file of its poses (KITTI, TUM, a folder ``oxts``) or topic of its bag; by default those that the
 /// recording contains, if there are any. ``calib_file``: calibration of the camera whose poses these are.
-/// ``body_from_lidar``: x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses these are. ``topic``: of the
-/// point clouds in a bag with several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used.
+/// ``body_from_lidar``: x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses these are. ``layout``: name
+/// of the layout, such as ``"mulran"``; by default as the files show. ``topic``: of the point clouds in a bag with several, or name of a
+/// lidar or scene in a folder with several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used.
 /// ``motion_compensation``: ``"auto"``, ``"order"``, a rotation such as ``"clockwise"``, or None for compensated scans.
 /// ``elevation_bias_deg``: angle to add to the elevations of all points [deg].
 ///
@@ -281,13 +283,14 @@ pub fn without_poses() -> PyErr {
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "they have names in Python")]
 #[pyo3(signature = (
-    path, poses=None, *, topic=None, calib_file=None, body_from_lidar=None, start_idx=0, n_scans=-1, frame_step=1,
+    path, poses=None, *, layout=None, topic=None, calib_file=None, body_from_lidar=None, start_idx=0, n_scans=-1, frame_step=1,
     motion_compensation=Some("auto".to_owned()), elevation_bias_deg=0.0
 ))]
 pub fn read_recording(
     py: Python<'_>,
     path: PathBuf,
     poses: Option<PathBuf>,
+    layout: Option<String>,
     topic: Option<String>,
     calib_file: Option<PathBuf>,
     body_from_lidar: Option<[f64; 6]>,
@@ -303,6 +306,8 @@ pub fn read_recording(
         frame_step,
     };
     selection.validate().map_err(raised)?;
+    let layout = layout.map(|name| name.parse::<Layout>()).transpose();
+    let layout = layout.map_err(|error| PyValueError::new_err(error.to_string()))?;
     let motion_compensation = motion_compensation.map(MotionCompensation::try_from);
     let known = SensorConfig {
         motion_compensation: motion_compensation
@@ -311,7 +316,8 @@ pub fn read_recording(
         ..SensorConfig::default()
     };
     let (recording, sensor) = released(py, || {
-        let mut recording = recording::Recording::open_with(&path, topic.as_deref(), &selection)?;
+        let mut recording =
+            recording::Recording::open_with(&path, layout, topic.as_deref(), &selection)?;
         recording.body_from_lidar = body_from_lidar.map(pose_from_degrees);
         let recording = recording.with_elevation_bias(elevation_bias_deg.to_radians());
         let track = match &poses {

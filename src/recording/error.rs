@@ -20,6 +20,8 @@ pub enum RecordingError {
     #[error("{} {problem}", path.display())]
     BadScan { path: PathBuf, problem: String },
     #[error("{} {problem}", path.display())]
+    BadTable { path: PathBuf, problem: String },
+    #[error("{} {problem}", path.display())]
     BadBag { path: PathBuf, problem: String },
     #[error("{}: message {number} of {topic} {problem}", path.display())]
     BadMessage {
@@ -28,6 +30,21 @@ pub enum RecordingError {
         number: usize,
         problem: String,
     },
+    #[error("{} is no recording of {layout}, which has {needs}; give its folder, or leave the layout out", path.display())]
+    NotInLayout {
+        path: PathBuf,
+        layout: &'static str,
+        needs: &'static str,
+    },
+    #[error("{} has several {kind}{named}; choose one of: {known}", path.display())]
+    ChoosePart {
+        path: PathBuf,
+        kind: &'static str,
+        named: String,
+        known: String,
+    },
+    #[error("{} does not exist, and the poses have no times without it; copy it there from the archive of the scans", path.display())]
+    NoTimes { path: PathBuf },
     #[error("{} has no topic of {types}; it has {found}", path.display())]
     NoTopic {
         path: PathBuf,

@@ -7,7 +7,7 @@ use std::sync::Arc;
 #[cfg(feature = "bags")]
 use super::bags::Bag;
 use super::error::RecordingError;
-use super::scan_files;
+use super::scan_files::{self, PointFormat};
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::{Motion, PointTiming, Scan};
 
@@ -20,6 +20,8 @@ pub enum ScanSource {
         path: PathBuf,
         /// The stamp of its scan, to which times of points are relative [s]; `None` if unknown.
         stamp_s: Option<f64>,
+        /// How its points are stored.
+        format: PointFormat,
     },
     /// In memory; times of its points are those after the moment of the pose.
     Memory(Arc<Scan>),
@@ -38,7 +40,11 @@ pub enum ScanSource {
 impl ScanSource {
     fn read(&self) -> Result<Scan, RecordingError> {
         match self {
-            Self::File { path, stamp_s } => Ok(scan_files::read_stamped(path, *stamp_s)?.scan),
+            Self::File {
+                path,
+                stamp_s,
+                format,
+            } => Ok(scan_files::read_formatted(path, *format, *stamp_s)?.scan),
             Self::Memory(scan) => Ok(Scan::clone(scan)),
             #[cfg(feature = "bags")]
             Self::Message { bag, topic, index } => bag.read_scan(topic, *index),

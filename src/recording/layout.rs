@@ -1,20 +1,61 @@
 //! Layouts of recordings, recognized by their files.
 
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
-/// How a recording is stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+use serde::de::IntoDeserializer as _;
+use serde::{Deserialize, Serialize};
+
+use super::scan_files::PointFormat;
+use super::scan_list::ScanFile;
+
+/// How a recording is stored. Names in configurations are those of the data loaders of KISS-ICP.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
 pub enum Layout {
     /// `velodyne/`, `times.txt`, `poses.txt` and `calib.txt` of the KITTI odometry benchmark.
+    #[serde(rename = "kitti")]
     KittiOdometry,
     /// `velodyne_points/data`, `velodyne_points/timestamps.txt` and `oxts/` of KITTI's raw data.
     KittiRaw,
+    /// A drive below `data_3d_raw/` of KITTI-360, with `data_poses/` and `calibration/`.
+    Kitti360,
+    /// `Ouster/` and `global_pose.csv` of MulRan.
+    Mulran,
+    /// `velodyne_sync/` of NCLT, with `ground_truth/` in the folder above.
+    Nclt,
+    /// `lidar/` and `applanix/lidar_poses.csv` of Boreas.
+    Boreas,
+    /// `LiDAR/` and `LiDAR_GT/` of HeLiPR, with a folder per lidar.
+    Helipr,
+    /// `raw_format/ouster_scan/` and `ground_truth/registered_poses.csv` of the Newer College data set.
+    #[serde(rename = "ncd")]
+    NewerCollege,
+    /// `samples/`, `sweeps/` and the tables `v1.0-*/` of nuScenes, with many scenes.
+    Nuscenes,
+    /// `pcds/` and `poses/gt_poses.txt` of Apollo's sequences for localization.
+    Apollo,
+    /// `frames/` and `gt_traj_lidar.txt` of Paris-Luco.
+    ParisLuco,
     /// Scan files in a folder.
+    #[serde(rename = "generic")]
     Folder,
     /// MCAP, rosbag2 or a bag of ROS 1.
+    #[serde(alias = "mcap", alias = "rosbag")]
     Bag,
     /// Scans in memory.
+    #[serde(skip)]
     Memory,
+}
+
+impl FromStr for Layout {
+    type Err = serde::de::value::Error;
+
+    /// A layout by its name in configurations, such as `mulran`.
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        Self::deserialize(name.into_deserializer())
+    }
 }
 
 impl Layout {
@@ -23,6 +64,15 @@ impl Layout {
         match self {
             Self::KittiOdometry => "KITTI odometry",
             Self::KittiRaw => "KITTI raw",
+            Self::Kitti360 => "KITTI-360",
+            Self::Mulran => "MulRan",
+            Self::Nclt => "NCLT",
+            Self::Boreas => "Boreas",
+            Self::Helipr => "HeLiPR",
+            Self::NewerCollege => "Newer College",
+            Self::Nuscenes => "nuScenes",
+            Self::Apollo => "Apollo",
+            Self::ParisLuco => "Paris-Luco",
             Self::Folder => "folder of scans",
             Self::Bag => "bag",
             Self::Memory => "scans in memory",
@@ -41,31 +91,48 @@ pub struct RecordingFiles {
     pub times: Option<PathBuf>,
     /// Times in the folder above, which may be those of another recording.
     pub(super) times_above: Option<PathBuf>,
-    /// Poses of the recording: a file, or KITTI's folder `oxts`.
+    /// Poses of the recording: a file, KITTI's folder `oxts`, or the tables of nuScenes.
     pub poses: Option<PathBuf>,
     /// Calibration of the recording.
     pub calibration: Option<PathBuf>,
+    /// How the points of a scan are stored.
+    pub(super) format: PointFormat,
+    /// The scans, where they are not all that are below their folder.
+    pub(super) listed: Option<Vec<ScanFile>>,
+    /// Name of the lidar or the scene, where the folder has several.
+    pub(super) part: Option<String>,
 }
 
 impl RecordingFiles {
     /// A bag, which has its times and poses in itself.
     pub(crate) fn bag(path: &Path) -> Self {
         Self {
-            layout: Layout::Bag,
             scans: path.to_owned(),
-            ..Self::memory()
+            ..Self::without_files(Layout::Bag)
         }
     }
 
     /// No files.
-    pub(super) fn memory() -> Self {
+    pub(super) fn without_files(layout: Layout) -> Self {
         Self {
-            layout: Layout::Memory,
+            layout,
             scans: PathBuf::new(),
             times: None,
             times_above: None,
             poses: None,
             calibration: None,
+            format: PointFormat::default(),
+            listed: None,
+            part: None,
+        }
+    }
+
+    /// Scans in a folder with the poses in a file that may be missing.
+    pub(super) fn new(layout: Layout, scans: PathBuf, poses: PathBuf) -> Self {
+        Self {
+            scans,
+            poses: poses.exists().then_some(poses),
+            ..Self::without_files(layout)
         }
     }
 
@@ -95,31 +162,40 @@ impl RecordingFiles {
         let times_above = existing(&above, &["times.txt"]);
         if base.join("velodyne_points/data").is_dir() {
             return Self {
-                layout: Layout::KittiRaw,
                 scans: base.join("velodyne_points/data"),
                 times: existing(base, &["velodyne_points/timestamps.txt"]),
                 times_above: None,
                 poses: existing(base, &["oxts"]).or_else(poses),
                 calibration,
+                ..Self::without_files(Layout::KittiRaw)
             };
         }
         if base.join("velodyne").is_dir() {
             return Self {
-                layout: Layout::KittiOdometry,
                 scans: base.join("velodyne"),
                 times,
                 times_above,
-                poses: poses(),
+                poses: poses().or_else(|| benchmark_poses(base)),
                 calibration,
+                ..Self::without_files(Layout::KittiOdometry)
             };
         }
         Self {
-            layout: Layout::Folder,
             scans: folder.to_owned(),
             times,
             times_above,
             poses: poses(),
             calibration,
+            ..Self::without_files(Layout::Folder)
         }
     }
+}
+
+/// `poses/NN.txt` of KITTI's odometry benchmark for its folder `sequences/NN`.
+fn benchmark_poses(sequence: &Path) -> Option<PathBuf> {
+    let sequences = sequence.parent().filter(|it| it.ends_with("sequences"))?;
+    let mut name = sequence.file_name()?.to_owned();
+    name.push(".txt");
+    let poses = sequences.with_file_name("poses").join(name);
+    poses.is_file().then_some(poses)
 }

@@ -13,6 +13,7 @@
 pub(crate) mod bags;
 pub(crate) mod frame;
 pub(crate) mod layout;
+mod layouts;
 pub(crate) mod open;
 pub(crate) mod scan_files;
 pub(crate) mod scan_list;
@@ -36,7 +37,7 @@ pub use frame::{Frame, ScanSource};
 pub use layout::{Layout, RecordingFiles};
 pub use open::{Recording, TimeSource};
 pub use poses::{read_times, read_tum, write_kitti, write_times, write_tum};
-pub use scan_files::read as read_scan;
+pub use scan_files::{PointFormat, read as read_scan};
 pub use scan_list::Selection;
 pub use track::PoseTrack;
 pub use velodyne::{read_labels, write_labels, write_scan};

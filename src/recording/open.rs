@@ -10,6 +10,7 @@ use super::calibration::Calibration;
 use super::error::RecordingError;
 use super::frame::{Frame, ScanSource};
 use super::layout::{Layout, RecordingFiles};
+use super::layouts;
 use super::oxts::read_timestamps;
 use super::poses::{ascending, read_rows_of_poses, read_times};
 use super::scan_files;
@@ -86,28 +87,40 @@ impl Recording {
     /// # Errors
     /// There are no scans, or their times do not ascend or cannot be read.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, RecordingError> {
-        Self::open_with(path.as_ref(), None, &Selection::default())
+        Self::open_with(path.as_ref(), None, None, &Selection::default())
     }
 
-    /// Opens the selected frames of a recording; of a bag those of `topic`, or of the only one with scans.
+    /// Opens the selected frames of a recording in a layout, or in the one that its files show. Where it has scans of several
+    /// lidars or scenes, `topic` names one: a topic of a bag, a lidar of HeLiPR, or a scene of nuScenes.
     ///
     /// # Errors
-    /// As [`open`](Self::open); the selection is empty, or the topic does not exist.
+    /// As [`open`](Self::open); the selection is empty, the recording is in another layout, or there is no such topic.
     pub fn open_with(
         path: &Path,
+        layout: Option<Layout>,
         topic: Option<&str>,
         selection: &Selection,
     ) -> Result<Self, RecordingError> {
         #[cfg(feature = "bags")]
-        if is_bag(path) {
+        if is_bag(path) && layout.is_none_or(|layout| layout == Layout::Bag) {
             return Self::open_bag(path, topic, selection);
         }
-        #[cfg(not(feature = "bags"))]
-        let _ = topic;
-        let files = RecordingFiles::find(path);
-        let scans = scan_list::scan_files(&files.scans)?;
+        let mut files = layouts::find(path, layout, topic)?;
+        let listed = files.listed.take();
+        let is_listed = listed.is_some();
+        let scans = match listed {
+            Some(listed) if listed.is_empty() => {
+                let path = files.scans;
+                return Err(RecordingError::NoScans { path });
+            }
+            Some(listed) => listed,
+            None => scan_list::scan_files(&files.scans)?,
+        };
+        let format = files.format;
         let rows = scans.last().map_or(0, |last| last.number + 1);
-        let (time_source, recorded_s) = if scans[0].time_s.is_some() {
+        let (time_source, recorded_s) = if is_listed {
+            (files.poses.clone().map(TimeSource::File), None)
+        } else if scans[0].time_s.is_some() {
             tracing::info!("the times of the scans are those in their names");
             (Some(TimeSource::Names), None)
         } else {
@@ -129,7 +142,11 @@ impl Recording {
                 });
             };
             let path = scan.path;
-            let source = ScanSource::File { path, stamp_s };
+            let source = ScanSource::File {
+                path,
+                stamp_s,
+                format,
+            };
             Ok(Frame::new(scan.number, source, time_s))
         };
         let frames: Vec<Frame> = scans.into_iter().map(frame).collect::<Result<_, _>>()?;
@@ -190,7 +207,12 @@ impl Recording {
         };
         let count = scans.len();
         let frames = scans.into_iter().enumerate().map(frame).collect();
-        Self::new(RecordingFiles::memory(), count, has_times, frames)
+        Self::new(
+            RecordingFiles::without_files(Layout::Memory),
+            count,
+            has_times,
+            frames,
+        )
     }
 
     fn new(files: RecordingFiles, scans: usize, has_times: bool, frames: Vec<Frame>) -> Self {
@@ -225,7 +247,8 @@ impl Recording {
                 path: self.path.clone(),
             });
         };
-        PoseTrack::read(path, self.files.calibration.as_deref())
+        let calibration = self.files.calibration.as_deref();
+        layouts::read_poses(&self.files).unwrap_or_else(|| PoseTrack::read(path, calibration))
     }
 
     /// The poses of the only topic of poses in a bag, as odometry: only the motion between them is used.
@@ -250,6 +273,13 @@ impl Recording {
         #[cfg(feature = "bags")]
         if let (Some((bag, topic)), true) = (&self.bag, is_topic(path)) {
             return PoseTrack::read_topic(bag, path.to_str(), topic, self.body_from_lidar);
+        }
+        // The poses of a data set are in a format of its own.
+        let own = self.files.poses.as_deref();
+        if own.is_some_and(|own| is_same_file(own, path))
+            && let Some(track) = layouts::read_poses(&self.files)
+        {
+            return track;
         }
         PoseTrack::read_mounted(path, calib_file, self.body_from_lidar)
     }
@@ -371,15 +401,26 @@ impl Recording {
     }
 }
 
+/// Whether two paths lead to one file.
+fn is_same_file(a: &Path, b: &Path) -> bool {
+    let canonical = |path: &Path| path.canonicalize().ok();
+    a == b || canonical(a).is_some_and(|a| Some(a) == canonical(b))
+}
+
 /// Time from the stamp of a scan of a file to its moment, the middle of its sweep [s]; 0 without times of points.
 fn moment_after_stamp_s(source: &ScanSource) -> Result<f64, RecordingError> {
-    let ScanSource::File { path, stamp_s } = source else {
+    let ScanSource::File {
+        path,
+        stamp_s,
+        format,
+    } = source
+    else {
         return Ok(0.0);
     };
-    if !scan_files::has_named_columns(path) {
+    if !scan_files::has_named_columns(path, *format) {
         return Ok(0.0);
     }
-    let read = scan_files::read_stamped(path, *stamp_s)?;
+    let read = scan_files::read_formatted(path, *format, *stamp_s)?;
     if read.has_unknown_times {
         tracing::warn!(
             "{}: the times of the points are ignored: in no unit do they last 10 ms to 1 s",
@@ -399,7 +440,7 @@ fn recorded_times(
     let ascending = |path: &Path, times_s| Ok(Some((path.to_owned(), ascending(path, times_s)?)));
     if let Some(path) = &files.times {
         let times_s = match files.layout {
-            Layout::KittiRaw => read_timestamps(path)?,
+            Layout::KittiRaw | Layout::Kitti360 => read_timestamps(path)?,
             _ => read_times(path)?,
         };
         return ascending(path, times_s);
@@ -446,7 +487,7 @@ mod tests {
     }
 
     fn open(folder: &Path, selection: &Selection) -> Result<Recording, RecordingError> {
-        Recording::open_with(folder, None, selection)?.with_own_poses()
+        Recording::open_with(folder, None, None, selection)?.with_own_poses()
     }
 
     fn numbers(recording: &Recording) -> Vec<usize> {

@@ -31,6 +31,8 @@ pub struct PoseTrack {
     pub calibration: Calibration,
     /// Frame of the poses in the world of the file.
     pub world_from_map: Pose3,
+    /// Whether up to half of the frames may be without a pose: the truth of data sets begins late, or pauses.
+    pub(super) is_partial: bool,
 }
 
 /// Whether so few frames have no pose that these can be left out: one and a hundredth of all, and not all.
@@ -133,10 +135,12 @@ impl PoseTrack {
             times_s: Some(times_s),
             calibration: Calibration::identity(),
             world_from_map,
+            is_partial: false,
         }
     }
 
-    fn of(
+    /// Poses of a camera or another body with its calibration; without times those of `times.txt` next to the file.
+    pub(super) fn of(
         path: &Path,
         camera: CameraPoses,
         calibration: Calibration,
@@ -164,6 +168,7 @@ impl PoseTrack {
             calibration,
             path: path.to_owned(),
             map_from_lidar,
+            is_partial: false,
         })
     }
 
@@ -179,7 +184,7 @@ impl PoseTrack {
     }
 
     /// The poses of frames. Frames after the last row or before the first are without one, with a
-    /// warning; an error if these are more than one and a hundredth of the frames.
+    /// warning; an error if these are more than one and a hundredth of the frames, or half of them in a data set.
     pub(crate) fn matched(
         &self,
         frames: &[Frame],
@@ -191,14 +196,21 @@ impl PoseTrack {
         let missing = || frames.iter().zip(&poses).filter(|(_, pose)| pose.is_none());
         let count = missing().count();
         if let Some((first, _)) = missing().next() {
-            if !may_be_missing(count, frames.len()) {
+            let is_partial = self.is_partial && 2 * count <= frames.len();
+            if !is_partial && !may_be_missing(count, frames.len()) {
                 return Err(self.mismatch(frames, have_times, first, count));
             }
-            let numbers: Vec<String> = missing()
+            /// Frames in a message.
+            const LISTED: usize = 100;
+            let numbers: Vec<String> = (missing().take(LISTED))
                 .map(|(frame, _)| frame.number.to_string())
                 .collect();
+            let rest = match count.saturating_sub(LISTED) {
+                0 => String::new(),
+                rest => format!(" and {rest} others"),
+            };
             tracing::warn!(
-                "{} has no pose for these frames, which are left out: {}",
+                "{} has no pose for these frames, which are left out: {}{rest}",
                 self.path.display(),
                 numbers.join(", ")
             );

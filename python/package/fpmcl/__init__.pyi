@@ -308,6 +308,7 @@ def read_recording(
     path: _Path,
     poses: Optional[_Path] = None,
     *,
+    layout: Optional[str] = None,
     topic: Optional[str] = None,
     calib_file: Optional[_Path] = None,
     body_from_lidar: Optional[ArrayLike] = None,
@@ -317,12 +318,14 @@ def read_recording(
     motion_compensation: Optional[str] = "auto",
     elevation_bias_deg: float = 0.0,
 ) -> Recording:
-    """Opens a recording: a folder of scans (KITTI odometry, KITTI raw, .bin, .pcd, .ply, .npy) or a bag (MCAP, rosbag2, ROS 1).
+    """Opens a recording: a folder of scans (.bin, .pcd, .ply, .npy), a data set such as KITTI, MulRan or nuScenes, or a bag (MCAP, rosbag2,
+    ROS 1).
 
     ``poses``: file of its poses (KITTI, TUM, a folder ``oxts``) or topic of its bag; by default those that the recording
     contains, if there are any. ``calib_file``: calibration of the camera whose poses these are. ``body_from_lidar``: x, y, z
-    [m], roll, pitch, yaw [deg] of the lidar on the body whose poses these are. ``topic``: of the point clouds in a bag with
-    several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used. ``motion_compensation``:
+    [m], roll, pitch, yaw [deg] of the lidar on the body whose poses these are. ``layout``: name of the layout, such as
+    ``"mulran"``; by default as the files show. ``topic``: of the point clouds in a bag with several, or name of a lidar or scene in a
+    folder with several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used. ``motion_compensation``:
     ``"auto"``, a rotation such as ``"clockwise"``, or None for compensated scans. ``elevation_bias_deg``: angle to add to the
     elevations of all points [deg].
 

@@ -20,7 +20,7 @@ use crate::map::MapCache;
 use crate::map::files::ply;
 use crate::map::tiles::contents::{self, CacheKind};
 use crate::map::unit_doubt;
-use crate::recording::{PoseTrack, Recording, Selection, TimeSource, scan_files};
+use crate::recording::{Layout, PoseTrack, Recording, Selection, TimeSource, scan_files};
 use crate::sensor::{BeamSource, Sensor, SensorConfig, spread_scans};
 use crate::validation::{InvalidValue, Validate};
 
@@ -30,7 +30,11 @@ pub struct InfoArgs {
     /// Recording (its folder, the folder of its scans, or a bag), scan or point cloud (.bin, .pcd, .ply, .npy), map (.ply), or result (.npz).
     pub path: PathBuf,
 
-    /// Set the key topic, the topic of the scans in a bag with several: topic=/NAME.
+    /// Layout of the recording, such as kitti, mulran or nuscenes; by default as its files show.
+    #[arg(long, value_name = "NAME")]
+    pub layout: Option<String>,
+
+    /// Set the key topic, the topic of the scans in a bag with several, or a lidar or scene in a folder with several: topic=/NAME.
     #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
     pub settings: Vec<(String, String)>,
 
@@ -57,7 +61,9 @@ impl InfoArgs {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 struct InfoConfig {
-    /// Topic of the point clouds, in a bag with several.
+    /// Layout of the recording; `None`: as its files show.
+    layout: Option<Layout>,
+    /// Topic of the point clouds in a bag with several, or name of a lidar or scene in a folder with several.
     topic: Option<String>,
 }
 
@@ -70,7 +76,9 @@ impl Validate for InfoConfig {
 /// Describes what is at a path.
 pub fn run(args: &InfoArgs) -> Result<Printed> {
     let path = args.path.as_path();
-    let config = settings::with_settings(InfoConfig::default(), &args.settings)?;
+    let layout = (args.layout.iter()).map(|name| ("layout".to_owned(), name.clone()));
+    let settings: Vec<_> = args.settings.iter().cloned().chain(layout).collect();
+    let config = settings::with_settings(InfoConfig::default(), &settings)?;
     ensure!(
         path.exists(),
         "{} does not exist; give a recording (a folder or a bag), a scan or point cloud, a map (.ply) or a result (.npz)",
@@ -80,7 +88,7 @@ pub fn run(args: &InfoArgs) -> Result<Printed> {
         clear_cache(path)?;
     }
     if path.is_dir() || input::is_bag(path) {
-        recording(path, config.topic.as_deref())
+        recording(path, &config)
     } else if settings::is_result(path) {
         result(path)
     } else if scan_files::is_mesh(path) {
@@ -135,8 +143,9 @@ struct PosesInfo {
     last_s: Option<f64>,
 }
 
-fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
-    let recording = Recording::open_with(path, topic, &Selection::default())?;
+fn recording(path: &Path, config: &InfoConfig) -> Result<Printed> {
+    let topic = config.topic.as_deref();
+    let recording = Recording::open_with(path, config.layout, topic, &Selection::default())?;
     let frames = &recording.frames;
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
     let scans = spread_scans(&recording)?;

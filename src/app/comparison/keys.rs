@@ -99,7 +99,7 @@ impl KeyCache {
             Input::Scans(bag, _) if is_bag(bag) => self.file(bag),
             Input::Scans(folder, selection) => {
                 self.once(format!("{folder:?} {selection:?}"), || {
-                    let recording = Recording::open_with(folder, None, &selection)?;
+                    let recording = Recording::open_with(folder, None, None, &selection)?;
                     let mut hashes = (recording.frames.par_iter())
                         .map(|frame| {
                             let content = hash_of_scan(&frame.read()?);

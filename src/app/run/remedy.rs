@@ -44,6 +44,7 @@ fn remedy(error: &(dyn Error + 'static)) -> Option<&'static str> {
         RecordingError::SeveralTopics { .. } => {
             Some("name it with the key topic (scans) or with --poses (poses)")
         }
+        RecordingError::ChoosePart { .. } => Some("name it with --set topic=NAME"),
         RecordingError::TopicNotNamed { .. } => Some("name it with --poses"),
         RecordingError::NoPoseFile { .. } => Some("name it with --poses"),
         RecordingError::NoMounting { .. } => Some("--poses names a file of poses"),

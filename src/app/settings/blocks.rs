@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::geometry::{Pose3, pose_from_degrees};
-use crate::recording::Selection;
+use crate::recording::{Layout, Selection};
 use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 
 /// The recording that a command reads.
@@ -20,7 +20,10 @@ pub struct RecordingConfig {
     /// The recording: its folder, the folder of its scans, or a bag.
     #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
-    /// Topic of the point clouds in a bag with several.
+    /// Layout of the recording: `kitti`, `kitti_raw`, `kitti360`, `mulran`, `nclt`, `boreas`, `helipr`, `ncd`, `nuscenes`, `apollo`,
+    /// `paris_luco`, `generic` (a folder of scans) or `bag`; `None`: as its files show.
+    pub layout: Option<Layout>,
+    /// Topic of the point clouds in a bag with several, or name of a lidar or scene in a folder with several.
     pub topic: Option<String>,
     /// The frames that are used.
     pub frames: Selection,

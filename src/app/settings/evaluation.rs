@@ -8,7 +8,7 @@ use smart_default::SmartDefault;
 
 use super::blocks::{OutputConfig, PoseInputConfig, optional_path, require_path};
 use crate::evaluation::Alignment;
-use crate::recording::Selection;
+use crate::recording::{Layout, Selection};
 use crate::validation::{InvalidValue, Validate, at_least_one, nested, positive, require};
 
 /// Configuration of `evaluate`: the keys of range-mcl's `evaluation.yml`, then new ones.
@@ -26,7 +26,9 @@ pub struct EvaluationConfig {
     pub given_poses: PoseInputConfig,
     /// The recording whose poses are the ground truth; `None`: for a topic, that of the localization.
     pub scan_folder: Option<PathBuf>,
-    /// Topic of the point clouds in a bag with several.
+    /// Layout of the recording; `None`: that of the localization, or as its files show.
+    pub layout: Option<Layout>,
+    /// Topic of the point clouds in a bag with several, or name of a lidar or scene in a folder with several.
     pub topic: Option<String>,
     /// Alignment with the truth before errors are computed; `None`: none for a result in a map, and that of the
     /// first pose for a trajectory.

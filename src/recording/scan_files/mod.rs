@@ -1,4 +1,4 @@
-//! Files of one scan: `.bin` of KITTI, SemanticKITTI and nuScenes, `.pcd`, `.ply` and `.npy`.
+//! Files of one scan: `.bin` of KITTI, SemanticKITTI and nuScenes, `.pcd`, `.ply` and `.npy`, and records of other data sets.
 
 mod bin;
 pub(crate) mod npy;
@@ -6,6 +6,7 @@ mod pcd;
 mod ply;
 pub(super) mod point_table;
 pub(super) mod point_times;
+pub(super) mod records;
 
 use std::fs::File;
 use std::io::BufReader;
@@ -15,6 +16,7 @@ use glam::Vec3;
 
 use self::point_table::Table;
 use self::point_times::set_times;
+pub use self::records::PointFormat;
 use super::error::RecordingError;
 use super::velodyne::read_bytes;
 use crate::lidar::Scan;
@@ -34,8 +36,8 @@ pub fn is_mesh(path: &Path) -> bool {
 }
 
 /// Whether the columns of a file have names, so that points can have times.
-pub fn has_named_columns(path: &Path) -> bool {
-    is_scan(path) && !has_extension(path, "bin")
+pub fn has_named_columns(path: &Path, format: PointFormat) -> bool {
+    format != PointFormat::default() || is_scan(path) && !has_extension(path, "bin")
 }
 
 /// A scan as it is read.
@@ -61,17 +63,33 @@ pub fn read(path: &Path) -> Result<Scan, RecordingError> {
 /// its sweep if the points have times, else the stamp; points with times of another clock have the stamp in the
 /// middle.
 pub fn read_stamped(path: &Path, stamp_s: Option<f64>) -> Result<ReadScan, RecordingError> {
-    Ok(read_with_normals(path, stamp_s)?.0)
+    read_formatted(path, PointFormat::default(), stamp_s)
+}
+
+/// Reads a scan as [`read_stamped`], with its points in a format.
+pub fn read_formatted(
+    path: &Path,
+    format: PointFormat,
+    stamp_s: Option<f64>,
+) -> Result<ReadScan, RecordingError> {
+    Ok(read_with_normals(path, format, stamp_s)?.0)
 }
 
 /// A scan, and the normals of its points if the file has them.
 fn read_with_normals(
     path: &Path,
+    format: PointFormat,
     stamp_s: Option<f64>,
 ) -> Result<(ReadScan, Option<Vec<Vec3>>), RecordingError> {
     let bytes = read_bytes(path)?;
-    let read = match table(path, &bytes) {
-        Some(table) => table.and_then(|table| Ok((scan_of(&table, stamp_s)?, table.normals()))),
+    let table = match format.records {
+        Some(records) => Some(records.table(&bytes)),
+        None => table(path, &bytes),
+    };
+    let read = match table {
+        Some(table) => {
+            table.and_then(|table| Ok((scan_of(&table, format, stamp_s)?, table.normals())))
+        }
         None => bin::parse(&bytes).map(|scan| {
             let time_s = stamp_s;
             let scan = Scan { time_s, ..scan };
@@ -91,8 +109,16 @@ fn read_with_normals(
     })
 }
 
-fn scan_of(table: &Table, stamp_s: Option<f64>) -> Result<ReadScan, String> {
-    let (mut scan, numbers) = table.points()?;
+fn scan_of(table: &Table, format: PointFormat, stamp_s: Option<f64>) -> Result<ReadScan, String> {
+    let (mut scan, mut numbers) = table.points()?;
+    if let Some(records) = format.records {
+        scan.points
+            .iter_mut()
+            .for_each(|point| *point = records.point_m(*point));
+    }
+    if let (true, Some(order)) = (numbers.is_empty(), format.order) {
+        numbers = order.times_s(scan.points.len());
+    }
     let has_times = set_times(&mut scan, &numbers, stamp_s) || set_times(&mut scan, &numbers, None);
     scan.time_s = scan.time_s.or(stamp_s);
     Ok(ReadScan {
@@ -112,7 +138,7 @@ pub struct ReadCloud {
 
 /// Reads a point cloud with its normals, fields `nx` or `normal_x` and so on.
 pub fn read_cloud(path: &Path) -> Result<ReadCloud, RecordingError> {
-    let (ReadScan { scan, .. }, normals) = read_with_normals(path, None)?;
+    let (ReadScan { scan, .. }, normals) = read_with_normals(path, PointFormat::default(), None)?;
     Ok(ReadCloud { scan, normals })
 }
 

@@ -11,7 +11,7 @@ use crate::app::settings::{EvaluationConfig, LocalizationConfig, RecordingConfig
 use crate::evaluation::{Alignment, aligned};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 use crate::recording::track::may_be_missing;
-use crate::recording::{Frame, PoseTrack, ScanSource, is_topic};
+use crate::recording::{Frame, PointFormat, PoseTrack, ScanSource, is_topic};
 
 /// Difference of times that are the same [s].
 const SAME_S: f64 = 1e-4;
@@ -30,6 +30,7 @@ pub fn read_track(
             .or(of_localization)
             .unwrap_or(Path::new(""))
             .to_owned(),
+        layout: (config.layout).or(localized.and_then(|it| it.recording.layout)),
         topic: topic
             .or(localized.and_then(|it| it.recording.topic.as_ref()))
             .cloned(),
@@ -95,6 +96,7 @@ fn poses_by_time(
             let source = ScanSource::File {
                 path: result_file.to_owned(),
                 stamp_s: None,
+                format: PointFormat::default(),
             };
             let frame = Frame::new(number, source, time_s);
             let pose = track.pose_at(&frame, true);

@@ -12,7 +12,7 @@ use crate::app::run::input::require_folder;
 use crate::app::settings::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
 use crate::recording::velodyne::label_file;
-use crate::recording::{Frame, Recording, ScanSource, scan_files, velodyne};
+use crate::recording::{Frame, PointFormat, Recording, ScanSource, scan_files, velodyne};
 
 /// Arguments of `ground`.
 #[derive(Clone, Debug, Args)]
@@ -104,6 +104,7 @@ pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<LabelledSc
         let source = ScanSource::File {
             path: path.to_owned(),
             stamp_s: None,
+            format: PointFormat::default(),
         };
         let folder = path.parent().unwrap_or(path);
         let frame = Frame::new(0, source, 0.0);
@@ -114,6 +115,7 @@ pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<LabelledSc
     }
     let recording = Recording::open_with(
         path,
+        config.recording.layout,
         config.recording.topic.as_deref(),
         &config.recording.frames,
     )?;
