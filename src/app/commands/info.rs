@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::app::report::results::Value;
 use crate::app::report::{LocalizationResults, RunSummary};
 use crate::app::run::arguments::setting;
-use crate::app::run::{MachineArgs, Printed, gibibytes, input};
+use crate::app::run::{MachineArgs, Printed, RecordingArgs, gibibytes, input};
 use crate::app::settings;
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Aabb;
@@ -30,9 +30,9 @@ pub struct InfoArgs {
     /// Recording (its folder, the folder of its scans, or a bag), scan or point cloud (.bin, .pcd, .ply, .npy), map (.ply), or result (.npz).
     pub path: PathBuf,
 
-    /// Layout of the recording, such as kitti, mulran or nuscenes; by default as its files show.
-    #[arg(long, value_name = "NAME")]
-    pub layout: Option<String>,
+    /// The recording.
+    #[command(flatten)]
+    pub recording: RecordingArgs,
 
     /// Set the key topic, the topic of the scans in a bag with several, or a lidar or scene in a folder with several: topic=/NAME.
     #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
@@ -76,7 +76,7 @@ impl Validate for InfoConfig {
 /// Describes what is at a path.
 pub fn run(args: &InfoArgs) -> Result<Printed> {
     let path = args.path.as_path();
-    let layout = (args.layout.iter()).map(|name| ("layout".to_owned(), name.clone()));
+    let layout = (args.recording.layout.iter()).map(|name| ("layout".to_owned(), name.clone()));
     let settings: Vec<_> = args.settings.iter().cloned().chain(layout).collect();
     let config = settings::with_settings(InfoConfig::default(), &settings)?;
     ensure!(

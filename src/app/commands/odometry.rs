@@ -10,7 +10,9 @@ use super::stages::{RecordingInputs, infer};
 use super::trajectory;
 use crate::app::report::RunFiles;
 use crate::app::report::odometry::{self, OdometryReport};
-use crate::app::run::{Claims, Context, Outputs, Printed, RunArgs, input, memory, output};
+use crate::app::run::{
+    Claims, Context, Outputs, Printed, RecordingArgs, RunArgs, input, memory, output,
+};
 use crate::app::settings::OdometryCommandConfig;
 use crate::mapping::{LostPath, check_path, find_poses};
 use crate::recording::Recording;
@@ -23,6 +25,11 @@ pub struct OdometryArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub run: RunArgs,
+
+    /// The recording.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub recording: RecordingArgs,
 
     /// Folder to write; sets the key `output_folder`.
     #[arg(long = "output", value_name = "FOLDER")]

@@ -14,7 +14,7 @@ use super::stages::{RecordingInputs, input_files};
 use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, Trajectory};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
 use crate::app::run::arguments::numbers;
-use crate::app::run::{Claims, Context, Outputs, RunArgs, input, output};
+use crate::app::run::{Claims, Context, Outputs, RecordingArgs, RunArgs, input, output};
 use crate::app::settings::{
     self, LocalizationConfig, NPZ, OdometrySource, OutputConfig, RefinementConfig,
 };
@@ -39,6 +39,11 @@ pub struct RefineArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub run: RunArgs,
+
+    /// The recording.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub recording: RecordingArgs,
 
     /// Recording; by default that of the localization. Sets the key `scan_folder`.
     #[arg(long = "recording", value_name = "RECORDING")]

@@ -24,8 +24,7 @@ use crate::app::run::artefact::hash::{hash_of_file, hash_of_scan, hash_of_texts}
 use crate::app::run::input::is_bag;
 use crate::app::run::version;
 use crate::app::settings::{PoseInputConfig, RecordingConfig};
-use crate::recording::is_topic;
-use crate::recording::{Recording, Selection};
+use crate::recording::{Recording, is_topic};
 use crate::simulation::SimulationConfig;
 
 /// Configuration keys without effect on the numbers: paths, plots, permission to replace files.
@@ -96,23 +95,26 @@ impl KeyCache {
                 }
                 Ok(hash_of_texts(&parts))
             }
-            Input::Scans(bag, _) if is_bag(bag) => self.file(bag),
-            Input::Scans(folder, selection) => {
-                self.once(format!("{folder:?} {selection:?}"), || {
-                    let recording = Recording::open_with(folder, None, None, &selection)?;
-                    let mut hashes = (recording.frames.par_iter())
-                        .map(|frame| {
-                            let content = hash_of_scan(&frame.read()?);
-                            Ok(format!("{} {} {content}", frame.number, frame.time_s))
-                        })
-                        .collect::<Result<Vec<String>>>()?;
-                    let files = recording.files;
-                    for path in files.poses.iter().chain(&files.calibration) {
-                        hashes.push(hash_of_file(path)?);
-                    }
-                    Ok(hash_of_texts(&hashes))
-                })
-            }
+            Input::Scans(config) if is_bag(&config.scan_folder) => self.file(&config.scan_folder),
+            Input::Scans(config) => self.once(format!("{config:?}"), || {
+                let recording = Recording::open_with(
+                    &config.scan_folder,
+                    config.layout,
+                    config.topic.as_deref(),
+                    &config.frames,
+                )?;
+                let mut hashes = (recording.frames.par_iter())
+                    .map(|frame| {
+                        let content = hash_of_scan(&frame.read()?);
+                        Ok(format!("{} {} {content}", frame.number, frame.time_s))
+                    })
+                    .collect::<Result<Vec<String>>>()?;
+                let files = recording.files;
+                for path in files.poses.iter().chain(&files.calibration) {
+                    hashes.push(hash_of_file(path)?);
+                }
+                Ok(hash_of_texts(&hashes))
+            }),
             Input::Topic(name) => Ok(format!("{name:?}")),
             Input::File(path) => self.file(path),
         }
@@ -189,7 +191,7 @@ enum Input<'a> {
     /// A part of a simulated drive: the drive, and the path below its folder.
     Simulated(&'a SimulationConfig, &'a Path),
     /// Selected scans of a folder, or a bag.
-    Scans(&'a Path, Selection),
+    Scans(&'a RecordingConfig),
     /// Topic of a bag.
     Topic(&'a Path),
     /// Any other file, or a folder of poses.
@@ -203,7 +205,7 @@ impl<'a> Input<'a> {
         recording: &'a RecordingConfig,
         poses: &'a PoseInputConfig,
     ) -> Vec<Self> {
-        let scans = Self::new(run, &recording.scan_folder, Some(recording.frames));
+        let scans = Self::new(run, &recording.scan_folder, Some(recording));
         let files = poses.pose_file.iter().chain(&poses.calib_file);
         let files = files.map(|path| Self::of_file(run, recording, path));
         std::iter::once(scans).chain(files).collect()
@@ -218,15 +220,15 @@ impl<'a> Input<'a> {
         }
     }
 
-    fn new(run: &'a PlannedRun, path: &'a Path, selection: Option<Selection>) -> Self {
+    fn new(run: &'a PlannedRun, path: &'a Path, recording: Option<&'a RecordingConfig>) -> Self {
         let below = |drive: &SimulationConfig| path.strip_prefix(drive.drive_folder()).ok();
         let simulated = run
             .drives
             .iter()
             .find_map(|drive| Some((drive, below(drive)?)));
-        match (simulated, selection) {
+        match (simulated, recording) {
             (Some((drive, path)), _) => Self::Simulated(drive, path),
-            (None, Some(selection)) => Self::Scans(path, selection),
+            (None, Some(recording)) => Self::Scans(recording),
             (None, None) => Self::File(path),
         }
     }
@@ -235,7 +237,8 @@ impl<'a> Input<'a> {
     fn name(&self) -> Result<String> {
         Ok(match self {
             Self::Simulated(drive, path) => format!("{} {path:?}", settings(drive)?),
-            Self::Scans(path, _) | Self::Topic(path) | Self::File(path) => format!("{path:?}"),
+            Self::Scans(recording) => format!("{:?}", recording.scan_folder),
+            Self::Topic(path) | Self::File(path) => format!("{path:?}"),
         })
     }
 }

@@ -65,6 +65,14 @@ pub struct RunArgs {
     pub force: bool,
 }
 
+/// Arguments of a command that reads a recording.
+#[derive(Clone, Debug, Args, Serialize)]
+pub struct RecordingArgs {
+    /// Layout of the recording, such as kitti, mulran or nuscenes; by default as its files show. Sets the key `layout`.
+    #[arg(long, value_name = "NAME")]
+    pub layout: Option<String>,
+}
+
 /// Loads the configuration of a command, and notes its file. Where the argument of the command is no
 /// configuration but an input, flags and settings change `base`, and the input is the value of `input_key`.
 pub fn configured<T: CommandConfig>(

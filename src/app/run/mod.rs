@@ -14,7 +14,7 @@ mod remedy;
 pub mod version;
 pub mod visible;
 
-pub use arguments::{ConfigArgs, RunArgs};
+pub use arguments::{ConfigArgs, RecordingArgs, RunArgs};
 pub use artefact::{CLAIMS_FILE, Claims, Lock, Outputs, PLY};
 pub use context::{Context, MachineArgs, gibibytes};
 pub use interrupt::{Interrupt, Interrupted};

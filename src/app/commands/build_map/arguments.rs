@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
-use crate::app::run::RunArgs;
+use crate::app::run::{RecordingArgs, RunArgs};
 use crate::recording::scan_files;
 
 /// Arguments of `build-map`.
@@ -15,6 +15,11 @@ pub struct BuildMapArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub run: RunArgs,
+
+    /// The recording.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub recording: RecordingArgs,
 
     /// Map to write; sets the key `mesh_file`.
     #[arg(long = "output", value_name = "MAP")]

@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use crate::app::report::run_output::{self, REPORT_FILES};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
-use crate::app::run::{Claims, Context, Outputs, RunArgs, input, output};
+use crate::app::run::{Claims, Context, Outputs, RecordingArgs, RunArgs, input, output};
 use crate::app::settings::{self, EvaluationConfig, LocalizationConfig};
 use crate::evaluation::alignment::level_camera_axes;
 use crate::evaluation::{Alignment, RangeMclRules};
@@ -30,6 +30,11 @@ pub struct EvaluateArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub run: RunArgs,
+
+    /// The recording.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub recording: RecordingArgs,
 
     /// True poses: rows of KITTI or TUM, a folder oxts, or a topic of the recording; by default those in the result. Sets the key `pose_file`.
     #[arg(long = "truth", value_name = "FILE")]

@@ -28,7 +28,7 @@ use crate::app::report::Report;
 use crate::app::report::export::Viewer;
 use crate::app::report::export::{McapFile, Sinks};
 use crate::app::run::arguments::yaml;
-use crate::app::run::{ConfigArgs, Context, RunArgs};
+use crate::app::run::{ConfigArgs, Context, RecordingArgs, RunArgs};
 use crate::app::settings::LocalizationConfig;
 use crate::localization::Start;
 
@@ -40,6 +40,11 @@ pub struct LiveArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub run: RunArgs,
+
+    /// The recording.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub recording: RecordingArgs,
 
     /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
     #[arg(long = "map", value_name = "MAP")]

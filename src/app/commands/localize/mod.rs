@@ -22,7 +22,7 @@ use self::written::{write_results, write_run, write_trajectories};
 use super::motion_source::MotionSource;
 use crate::app::report::Report;
 use crate::app::run::arguments::numbers;
-use crate::app::run::{Claims, Context, RunArgs};
+use crate::app::run::{Claims, Context, RecordingArgs, RunArgs};
 use crate::app::settings::LocalizationConfig;
 
 /// Files beside the scans and the map, of `localize` and `live`.
@@ -52,6 +52,11 @@ pub struct LocalizeArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub run: RunArgs,
+
+    /// The recording.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub recording: RecordingArgs,
 
     /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
     #[arg(long = "map", value_name = "MAP")]
