@@ -75,7 +75,7 @@
 //! |---|---|
 //! | foundations | `files`, [`geometry`], [`memory`], `random`, `shared_bytes`, `simd`, `statistics`, [`validation`] |
 //! | configurations as texts, with a feature | `configuration` |
-//! | sensor and rays | [`inertial`], [`lidar`], `raycasting` |
+//! | sensor, rays and Earth | [`georeference`], [`inertial`], [`lidar`], `raycasting` |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | motion | [`odometry`] |
 //! | inferred sensor | [`sensor`] |
@@ -111,7 +111,8 @@ pub mod validation;
 // Configurations as texts.
 #[cfg(feature = "configuration")]
 pub mod configuration;
-// Sensor and rays.
+// Sensor, rays and Earth.
+pub mod georeference;
 pub mod inertial;
 pub mod lidar;
 mod raycasting;

@@ -18,7 +18,7 @@ struct Restriction {
     reason: &'static str,
 }
 
-const RESTRICTIONS: [Restriction; 12] = [
+const RESTRICTIONS: [Restriction; 14] = [
     Restriction {
         words: &["memmap2::", "use memmap2"],
         allowed: &["shared_bytes.rs"],
@@ -43,6 +43,16 @@ const RESTRICTIONS: [Restriction; 12] = [
         words: &["zip::", "use zip"],
         allowed: &["app/report/results"],
         reason: "archives are confined to results",
+    },
+    Restriction {
+        words: &["proj4rs::", "use proj4rs"],
+        allowed: &["georeference"],
+        reason: "projections are confined to the georeference",
+    },
+    Restriction {
+        words: &["nmea::", "use chrono", "chrono::"],
+        allowed: &["recording/fixes"],
+        reason: "sentences of receivers are confined to their reader",
     },
     Restriction {
         words: &["rusqlite::", "ruzstd::", "lz4_flex::", "bzip2::"],

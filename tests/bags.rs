@@ -19,8 +19,8 @@ use fpmcl::recording::{Bag, FramePose, PoseTrack, RecordingError, TopicKind};
 use rayon::prelude::*;
 
 use bag_writers::{
-    Cloud, Kind, Recorded, compress, db3, livox, mcap, mcap_compressed, odometry, point_cloud2,
-    pose_stamped, ros1, transforms,
+    Cloud, Kind, Recorded, compress, db3, livox, mcap, mcap_compressed, nav_sat_fix, odometry,
+    point_cloud2, pose_stamped, ros1, transforms,
 };
 
 const START_NS: u64 = 1_700_000_000_250_000_000;
@@ -221,6 +221,56 @@ fn one_recording_in_every_format_is_the_same() {
             "{name}"
         );
     }
+}
+
+#[test]
+fn positions_of_a_receiver_are_the_same_in_every_serialization() {
+    let folder = tempfile::tempdir().unwrap();
+    let fixes = |kind| {
+        let mut messages = recording(kind);
+        for number in 0..4_u32 {
+            let time_ns = START_NS + 1_000_000_000 * u64::from(number);
+            // The second one has no fix, the third no known covariance, the fourth no height.
+            let status = if number == 1 { -1 } else { 0 };
+            let covariance_type = if number == 2 { 0 } else { 2 };
+            let height_m = if number == 3 { f64::NAN } else { 115.0 };
+            let position = [49.0 + 0.001 * f64::from(number), 8.4, height_m];
+            let known = (status, covariance_type);
+            let variances = [4.0, 4.0, 9.0];
+            messages.push(Recorded {
+                topic: "/gnss",
+                message_type: "sensor_msgs/msg/NavSatFix",
+                time_ns: time_ns + 5_000_000,
+                data: nav_sat_fix(kind, time_ns, "mast", known, position, variances),
+            });
+        }
+        let path = folder.path().join("fixes.mcap");
+        let serialization = if kind == Kind::Ros1 { "ros1" } else { "cdr" };
+        let options = mcap::WriteOptions::new().compression(None);
+        fs::write(&path, mcap(options, serialization, &messages)).unwrap();
+        let recording = fpmcl::recording::Recording::open(&path).unwrap();
+        recording.read_fixes(Path::new("/gnss")).unwrap()
+    };
+    let expected = fixes(Kind::CdrLittle);
+    assert_eq!((expected.fixes.len(), expected.without_position), (2, 2));
+    let [first, third] = [expected.fixes[0], expected.fixes[1]];
+    assert!((first.time_s - 1e-9 * START_NS as f64).abs() < 1e-6);
+    assert_eq!(
+        (first.position.latitude_deg, first.position.height_m),
+        (49.0, 115.0)
+    );
+    assert_eq!(
+        (first.horizontal_m, first.vertical_m),
+        (Some(2.0), Some(3.0))
+    );
+    assert_eq!(
+        (third.horizontal_m, third.position.latitude_deg),
+        (None, 49.002)
+    );
+    // The lidar is 1 m above the mast, turned by half a turn about z.
+    assert_eq!(expected.antenna_m, Some([0.0, 0.0, -1.0]));
+    assert_eq!(fixes(Kind::CdrBig), expected);
+    assert_eq!(fixes(Kind::Ros1), expected);
 }
 
 #[test]

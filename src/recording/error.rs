@@ -86,6 +86,18 @@ pub enum RecordingError {
     NoTr { path: PathBuf },
     #[error("{} contains no poses", path.display())]
     NoPoses { path: PathBuf },
+    #[error("{} has no fixes of a GNSS receiver: {without_position} messages are without a position, {bad_lines} lines are damaged; give sentences of NMEA with GGA, rows of time, latitude, longitude and height, a folder oxts, or a topic of sensor_msgs/NavSatFix", path.display())]
+    NoFixes {
+        path: PathBuf,
+        without_position: usize,
+        bad_lines: usize,
+    },
+    #[error("{}, line {line}: `{row}` is not on the Earth; give time [s], latitude, longitude [deg] and height [m]", path.display())]
+    NotOnEarth {
+        path: PathBuf,
+        line: usize,
+        row: String,
+    },
     #[error("{} contains no scans (.bin, .pcd, .ply or .npy); give the folder of a recording or of its scans, or a bag", path.display())]
     NoScans { path: PathBuf },
     #[error("{scan} has no pose: {} has {poses} rows; check that both belong to one recording, or select fewer frames with n_scans", pose_file.display())]

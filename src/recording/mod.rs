@@ -18,8 +18,10 @@ pub(crate) mod open;
 pub(crate) mod scan_files;
 pub(crate) mod scan_list;
 pub(crate) mod velodyne;
-// Poses.
+// Poses and positions.
 pub(crate) mod calibration;
+mod fixes;
+mod found_fixes;
 mod oxts;
 pub(crate) mod poses;
 pub(crate) mod track;
@@ -33,6 +35,7 @@ mod table;
 pub use bags::{Bag, FramePose, Topic, TopicKind};
 pub use calibration::Calibration;
 pub use error::RecordingError;
+pub use fixes::read as read_fixes;
 pub use frame::{Frame, ScanSource};
 pub use layout::{Layout, RecordingFiles};
 pub use open::{Recording, TimeSource};

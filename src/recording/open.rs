@@ -8,6 +8,7 @@ use std::sync::Arc;
 use super::bags::{Bag, TopicKind, is_bag};
 use super::calibration::Calibration;
 use super::error::RecordingError;
+use super::fixes;
 use super::frame::{Frame, ScanSource};
 use super::layout::{Layout, RecordingFiles};
 use super::layouts;
@@ -18,6 +19,7 @@ use super::scan_list::{self, ScanFile, Selection};
 use super::track::PoseTrack;
 use crate::geometry::Pose3;
 use crate::inertial::Imu;
+use crate::georeference::GeodeticFixes;
 use crate::lidar::{PointTiming, Scan};
 
 /// Revolutions per second of the sensor, for recordings without times.
@@ -282,6 +284,18 @@ impl Recording {
             return track;
         }
         PoseTrack::read_mounted(path, calib_file, self.body_from_lidar)
+    }
+
+    /// Reads positions of a GNSS receiver from a file, a folder `oxts`, or a topic of the bag of this recording.
+    ///
+    /// # Errors
+    /// The positions cannot be read, or there are none.
+    pub fn read_fixes(&self, path: &Path) -> Result<GeodeticFixes, RecordingError> {
+        #[cfg(feature = "bags")]
+        if let (Some((bag, topic)), true) = (&self.bag, is_topic(path)) {
+            return bag.fixes(&path.to_string_lossy(), topic);
+        }
+        fixes::read(path)
     }
 
     /// The same recording with the poses that it contains, `map_from_lidar` in the frame of the first of them.

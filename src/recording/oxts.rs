@@ -16,8 +16,10 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 
 use super::calibration::Calibration;
 use super::error::RecordingError;
+use super::found_fixes::{FoundFixes, is_position};
 use super::table::{parse_numbers, pose_from_row, position, read_rows, read_text};
 use crate::geometry::Pose3;
+use crate::georeference::{Geodetic, GeodeticFix};
 
 const EARTH_RADIUS_M: f64 = 6_378_137.0;
 
@@ -28,18 +30,8 @@ pub fn read(oxts: &Path) -> Result<(Vec<Pose3>, Calibration), RecordingError> {
     let mut scale = None;
     let mut poses = Vec::with_capacity(files.len());
     for path in &files {
-        let rows = read_rows(path)?;
-        let Some((line, [lat, lon, alt, roll, pitch, yaw, ..])) =
-            rows.first().map(|(line, row)| (*line, row.as_slice()))
-        else {
-            return Err(RecordingError::WrongCount {
-                path: path.clone(),
-                line: 1,
-                found: rows.first().map_or(0, |(_, row)| row.len()),
-                expected: 30,
-                layout: "latitude longitude altitude roll pitch yaw ...",
-            });
-        };
+        let (line, row) = read_row(path)?;
+        let [lat, lon, alt, roll, pitch, yaw] = &row.begin;
         let lat_rad = lat.to_radians();
         let scale = *scale.get_or_insert(lat_rad.cos() * EARTH_RADIUS_M);
         let x = scale * lon.to_radians();
@@ -72,6 +64,78 @@ pub fn data_files(oxts: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     }
     files.sort();
     Ok(files)
+}
+
+/// A row of measurements.
+struct Row {
+    /// Latitude, longitude [deg], altitude [m], roll, pitch, yaw [rad].
+    begin: [f64; 6],
+    /// Standard deviation of the position, where it is positive [m].
+    accuracy_m: Option<f64>,
+}
+
+/// Reads the only row of a file, with the number of its line.
+fn read_row(path: &Path) -> Result<(usize, Row), RecordingError> {
+    /// Column of the accuracy of the position.
+    const POS_ACCURACY: usize = 23;
+    let rows = read_rows(path)?;
+    let row = rows.first().map(|(line, row)| (*line, row.as_slice()));
+    let Some((line, begin)) = row.and_then(|(line, row)| Some((line, row.first_chunk()?))) else {
+        return Err(RecordingError::WrongCount {
+            path: path.to_owned(),
+            line: 1,
+            found: row.map_or(0, |(_, row)| row.len()),
+            expected: 30,
+            layout: "latitude longitude altitude roll pitch yaw ...",
+        });
+    };
+    let accuracy_m = row.and_then(|(_, row)| row.get(POS_ACCURACY).copied());
+    let row = Row {
+        begin: *begin,
+        accuracy_m: accuracy_m.filter(|&accuracy_m| accuracy_m > 0.0),
+    };
+    Ok((line, row))
+}
+
+/// Reads the positions of `oxts/data/*.txt` with the times of `oxts/timestamps.txt`. The antenna is where the measuring
+/// unit is, by `calib_imu_to_velo.txt`.
+pub fn read_fixes(oxts: &Path) -> Result<FoundFixes, RecordingError> {
+    let times_file = oxts.join("timestamps.txt");
+    let times_s = read_timestamps(&times_file)?;
+    let files = data_files(oxts)?;
+    if files.len() != times_s.len() {
+        return Err(RecordingError::WrongTimes {
+            path: times_file,
+            times: times_s.len(),
+            poses: files.len(),
+        });
+    }
+    let mut found = FoundFixes::default();
+    for (path, time_s) in files.iter().zip(times_s) {
+        let (line, row) = read_row(path)?;
+        let [latitude_deg, longitude_deg, height_m, ..] = row.begin;
+        if !is_position(latitude_deg, longitude_deg, height_m) {
+            return Err(RecordingError::NotOnEarth {
+                path: path.clone(),
+                line,
+                row: format!("{latitude_deg} {longitude_deg} {height_m}"),
+            });
+        }
+        found.fixes.push(GeodeticFix {
+            time_s,
+            position: Geodetic {
+                latitude_deg,
+                longitude_deg,
+                height_m,
+            },
+            horizontal_m: row.accuracy_m,
+            vertical_m: row.accuracy_m,
+        });
+    }
+    let imu_from_lidar = imu_from_lidar(oxts).ok();
+    found.antenna_m =
+        imu_from_lidar.map(|it| it.cam0_from_lidar.inverse().translation.vector.into());
+    Ok(found)
 }
 
 /// Reads the rotation and position of the sensor from `calib_imu_to_velo.txt`.

@@ -51,6 +51,10 @@ impl Serializer {
         self.number([number])
     }
 
+    pub fn u16(&mut self, number: u16) -> &mut Self {
+        self.number(number.to_le_bytes())
+    }
+
     pub fn u32(&mut self, number: u32) -> &mut Self {
         self.number(number.to_le_bytes())
     }
@@ -168,6 +172,23 @@ pub fn odometry(kind: Kind, stamp_ns: u64, frame: &str, child: &str, pose: &[f64
     let mut to = Serializer::new(kind);
     to.header(stamp_ns, frame).text(child).numbers(pose);
     to.numbers(&[0.0; 36]).numbers(&[0.0; 6 + 36]);
+    to.bytes
+}
+
+/// `sensor_msgs/NavSatFix` with a status, latitude, longitude [deg], altitude [m], and the diagonal of its covariance.
+pub fn nav_sat_fix(
+    kind: Kind,
+    stamp_ns: u64,
+    frame: &str,
+    (status, covariance_type): (i8, u8),
+    position: [f64; 3],
+    [xx, yy, zz]: [f64; 3],
+) -> Vec<u8> {
+    let mut to = Serializer::new(kind);
+    to.header(stamp_ns, frame).u8(status as u8).u16(1);
+    to.numbers(&position);
+    to.numbers(&[xx, 0.0, 0.0, 0.0, yy, 0.0, 0.0, 0.0, zz]);
+    to.u8(covariance_type);
     to.bytes
 }
 

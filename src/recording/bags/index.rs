@@ -20,6 +20,8 @@ pub enum Content {
     TransformTree,
     /// `sensor_msgs/Imu`.
     Imu,
+    /// `sensor_msgs/NavSatFix`.
+    Fix,
 }
 
 impl Content {
@@ -32,6 +34,7 @@ impl Content {
             "geometry_msgs/TransformStamped" => Self::Transform,
             "tf2_msgs/TFMessage" | "tf/tfMessage" => Self::TransformTree,
             "sensor_msgs/Imu" => Self::Imu,
+            "sensor_msgs/NavSatFix" => Self::Fix,
             _ => return None,
         })
     }

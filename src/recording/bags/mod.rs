@@ -13,6 +13,7 @@ mod fields;
 mod index;
 mod mcap_file;
 mod message;
+mod nav_sat_fix;
 mod point_cloud;
 #[cfg(feature = "ros2")]
 pub(crate) mod received;
@@ -29,8 +30,10 @@ pub use message::FramePose;
 pub use transforms::transform_between;
 
 use super::error::RecordingError;
+use super::found_fixes::FoundFixes;
 use crate::geometry::Pose3;
 use crate::inertial::ImuSample;
+use crate::georeference::GeodeticFixes;
 use crate::lidar::Scan;
 use bag_file::BagFile;
 use fields::Fields;
@@ -52,6 +55,8 @@ pub enum TopicKind {
     Poses,
     /// Inertial measurements: `sensor_msgs/Imu`.
     Inertial,
+    /// Positions of a GNSS receiver: `sensor_msgs/NavSatFix`.
+    Fixes,
 }
 
 impl TopicKind {
@@ -60,6 +65,7 @@ impl TopicKind {
             Self::Scans => &[Content::PointCloud, Content::LivoxCloud],
             Self::Poses => &[Content::Odometry, Content::Pose, Content::Transform],
             Self::Inertial => &[Content::Imu],
+            Self::Fixes => &[Content::Fix],
         };
         topic.count > 0
             && topic
@@ -74,6 +80,7 @@ impl TopicKind {
                 "poses (nav_msgs/Odometry, geometry_msgs/PoseStamped, PoseWithCovarianceStamped or TransformStamped)"
             }
             Self::Inertial => "inertial measurements (sensor_msgs/Imu)",
+            Self::Fixes => "positions (sensor_msgs/NavSatFix)",
         }
     }
 }
@@ -250,6 +257,30 @@ impl Bag {
         let mut samples = samples?;
         samples.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
         Ok((samples, frame))
+    }
+
+    /// Reads the positions of a GNSS receiver from a topic. The antenna is where the static transforms have the frame of the
+    /// messages; positions without a height are left out.
+    ///
+    /// # Errors
+    /// There is no such topic, a message cannot be decoded, or none has a position.
+    pub fn fixes(&self, topic: &str, scan_topic: &str) -> Result<GeodeticFixes, RecordingError> {
+        let topic = self.topic(TopicKind::Fixes, Some(topic))?;
+        let mut found = FoundFixes::default();
+        let mut frame = String::new();
+        for number in 0..topic.messages.len() {
+            let read = self.parse(topic, number, |message, log_s| {
+                nav_sat_fix::read(&mut Fields::new(message, topic.serialization)?, log_s)
+            })?;
+            frame = read.frame;
+            match read.fix {
+                Some(fix) => found.fixes.push(fix),
+                None => found.without_position += 1,
+            }
+        }
+        let lidar_from_antenna = self.body_from_lidar(&frame, scan_topic)?;
+        found.antenna_m = lidar_from_antenna.map(|it| it.inverse().translation.vector.into());
+        found.checked(Path::new(&topic.name))
     }
 
     /// Reads the transforms that do not change: those of topics `tf_static`, and of latched ones in ROS 1.
