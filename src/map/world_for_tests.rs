@@ -100,7 +100,7 @@ impl TestWorld {
                 .iter()
                 .map(|pose| crate::geometry::pose3_from_pose2(pose, 0.0))
                 .collect(),
-            sensor: None,
+            ..MappingPath::default()
         };
         let (tiles, ground) = (self.tiles.clone(), self.ground.clone());
         let renderer = std::sync::Arc::new(self.clone());

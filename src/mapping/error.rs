@@ -2,6 +2,7 @@
 
 use super::lost_path::LostPath;
 use super::pose_report::PoseReport;
+use crate::georeference::AlignmentError;
 use crate::localization::SecondDriveError;
 use crate::map::BuildError;
 use crate::map::build::path_check::ImplausiblePath;
@@ -37,6 +38,8 @@ pub enum MappingError {
     Memory(#[from] MemoryError),
     #[error(transparent)]
     SecondDrive(#[from] SecondDriveError),
+    #[error("the map has no place on the Earth: {0}")]
+    Alignment(#[from] AlignmentError),
     #[error(transparent)]
     Build(BuildError),
 }

@@ -8,6 +8,7 @@
 //! results between the steps, takes them one by one: `with_given_poses`, `checked`, `PoseSearch`, `key_frames`.
 
 mod error;
+mod georeferenced;
 mod lost_path;
 mod pose_check;
 mod pose_report;
@@ -18,6 +19,7 @@ mod trajectory;
 use std::sync::Arc;
 
 pub use error::MappingError;
+pub use georeferenced::georeferenced;
 pub use lost_path::LostPath;
 pub use pose_report::{PoseReport, Tilt};
 pub use trajectory::{InertialSummary, LoopCounts, TrajectorySummary};

@@ -9,7 +9,7 @@ use crate::inertial::Imu;
 use crate::localization::{LocalizerConfig, SecondDrive, SecondDriveError, Tracker, TrackerConfig};
 use crate::map::{Map, MapConfig, PoseSource};
 use crate::memory::MemoryBudget;
-use crate::odometry::{Trajectory, TrajectoryConfig};
+use crate::odometry::{GnssConstraints, Trajectory, TrajectoryConfig};
 use crate::recording::{Frame, PoseTrack, Recording};
 use crate::sensor::Sensor;
 
@@ -21,6 +21,7 @@ pub struct PoseSearch<'a> {
     sensor: &'a Sensor,
     older: Option<&'a Map>,
     config: &'a MapConfig,
+    gnss: Option<&'a GnssConstraints>,
 }
 
 impl<'a> PoseSearch<'a> {
@@ -47,7 +48,14 @@ impl<'a> PoseSearch<'a> {
             sensor,
             older,
             config,
+            gnss: None,
         }
+    }
+
+    /// The search with fixes of a GNSS receiver, which poses from the scans follow.
+    #[must_use]
+    pub fn with_gnss(self, gnss: Option<&'a GnssConstraints>) -> Self {
+        Self { gnss, ..self }
     }
 
     /// Whether given poses are polished.
@@ -86,6 +94,7 @@ impl<'a> PoseSearch<'a> {
                     self.is_given(),
                     self.imu(),
                     &settings,
+                    self.gnss,
                     memory_budget,
                     on_event,
                 )?;

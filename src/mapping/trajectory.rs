@@ -10,8 +10,8 @@ use crate::lidar::Scan;
 use crate::map::BuildEvent;
 use crate::memory::MemoryBudget;
 use crate::odometry::{
-    ElevationBias, InertialEstimate, LoopVerdict, StepState, Trajectory, TrajectoryBuilder,
-    TrajectoryConfig,
+    ElevationBias, GnssConstraints, InertialEstimate, LoopVerdict, StepState, Trajectory,
+    TrajectoryBuilder, TrajectoryConfig,
 };
 use crate::recording::Frame;
 
@@ -21,8 +21,8 @@ pub const ADJUSTMENT: &str = "loops and adjustment";
 /// Called for every event; the work ends soon after it returns `Break`.
 pub(super) type OnEvent<'a> = &'a dyn Fn(BuildEvent) -> ControlFlow<()>;
 
-/// Finds the poses of frames from their scans, level by an inertial sensor where there is one, or polishes those that are
-/// given.
+/// Finds the poses of frames from their scans and fixes, where there are some, level by an inertial sensor where there is one,
+/// or polishes those that are given.
 ///
 /// Its events are the stage `"odometry"` or `"polish"`, every scan, and the stage [`ADJUSTMENT`].
 pub fn find_poses(
@@ -30,11 +30,13 @@ pub fn find_poses(
     are_given: bool,
     imu: Option<&Imu>,
     config: &TrajectoryConfig,
+    gnss: Option<&GnssConstraints>,
     memory_budget: MemoryBudget,
     on_event: OnEvent,
 ) -> Result<Trajectory, MappingError> {
     let builder = TrajectoryBuilder::new(config.clone())?;
-    let mut builder = builder.with_memory_budget(memory_budget);
+    let builder = builder.with_memory_budget(memory_budget);
+    let mut builder = builder.with_gnss(gnss.cloned());
     if let Some(imu) = imu {
         builder = builder.with_imu(imu.clone());
     }

@@ -9,9 +9,9 @@ use glam::{DVec3, IVec3};
 
 use super::config::LoopConfig;
 use super::drive::{Drive, POINT_BYTES, SHORTER, Submap};
-use super::loops::{Drift, Loop, LoopVerdict, common_share};
+use super::loops::{Drift, Loop, common_share};
 use super::odometer::OdometryEstimate;
-use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
+use super::path_graph::{SUBMAP_LENGTH, loop_edges, move_along, odometry_edges};
 use super::pose_graph::{Edge, information, optimize};
 use super::voxel_map::{VoxelMap, pack};
 use crate::geometry::{Pose3, TriangleMesh, distances_m};
@@ -129,30 +129,6 @@ fn common_transform(drive: &Drive, found: &[(usize, Pose3)], drift_share: f64) -
     // Places that look alike do not agree with the odometry.
     best.filter(|(count, _)| 2 * count > found.len())
         .map(|(_, map_from_odom)| map_from_odom)
-}
-
-/// The loops that the poses follow, between the centers of their submaps.
-fn loop_edges(drive: &Drive, maps: &[Submap], loops: &[Loop]) -> Vec<Edge> {
-    /// Standard deviations [m], [rad].
-    const SHIFT_M: f64 = 0.05;
-    const TURN_RAD: f64 = 0.005;
-    let motion = |a: usize, b: usize| drive.poses[a].inverse() * drive.poses[b];
-    let map_of = |row: usize| maps.partition_point(|map| map.rows.end <= row);
-    (loops.iter())
-        .filter(|found| found.verdict == LoopVerdict::Accepted)
-        .map(|found| {
-            let [first, second] = [found.first, found.second].map(map_of);
-            Edge {
-                first,
-                second,
-                first_from_second: motion(maps[first].center, found.first)
-                    * found.first_from_second
-                    * motion(found.second, maps[second].center),
-                information: information(SHIFT_M, TURN_RAD),
-                is_loop: true,
-            }
-        })
-        .collect()
 }
 
 /// For each submap, the scan nearest to its center that was found in the map.

@@ -19,6 +19,7 @@
 //! level         with an inertial sensor: tilt from gravity, and the height that follows
 //! loops         submaps of the path, recognized by position and appearance, registered, confirmed by a second loop
 //! pose_graph    poses of the submaps, with a robust kernel for loops; the scans between move along
+//! gnss          fixes of a receiver, where there are some, as further edges of the graph
 //! adjustment    all poses and the planes that the scans have in common
 //! ```
 //!
@@ -34,6 +35,7 @@ mod block_system;
 mod config;
 mod drive;
 mod elevation_bias;
+mod gnss;
 mod level;
 mod loops;
 mod odometer;
@@ -54,6 +56,7 @@ pub use adjustment::{Adjusted, AdjustmentConfig};
 pub use anchors::{NotInMap, PlacementError};
 pub use config::{LoopConfig, OdometryConfig};
 pub use elevation_bias::ElevationBias;
+pub use gnss::GnssConstraints;
 pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{MotionDifference, PoseCheck, PoseFit, PoseMeaning};

@@ -1,6 +1,8 @@
 //! The pose graph of a drive: its submaps, the motions between them, and the scans that move with them.
 
+use super::block_system::BlockSystem;
 use super::drive::{Drive, Submap};
+use super::loops::{Loop, LoopVerdict};
 use super::odometer::OdometryEstimate;
 use super::pose_graph::{Edge, information};
 use crate::geometry::Pose3;
@@ -37,6 +39,52 @@ pub fn odometry_edges(drive: &Drive, maps: &[Submap], odometry: &[OdometryEstima
             }
         })
         .collect()
+}
+
+/// The loops that the poses follow, between the centers of their submaps.
+pub fn loop_edges(drive: &Drive, maps: &[Submap], loops: &[Loop]) -> Vec<Edge> {
+    /// Standard deviations [m], [rad].
+    const SHIFT_M: f64 = 0.05;
+    const TURN_RAD: f64 = 0.005;
+    let motion = |a: usize, b: usize| drive.poses[a].inverse() * drive.poses[b];
+    let map_of = |row: usize| maps.partition_point(|map| map.rows.end <= row);
+    (loops.iter())
+        .filter(|found| found.verdict == LoopVerdict::Accepted)
+        .map(|found| {
+            let [first, second] = [found.first, found.second].map(map_of);
+            Edge {
+                first,
+                second,
+                first_from_second: motion(maps[first].center, found.first)
+                    * found.first_from_second
+                    * motion(found.second, maps[second].center),
+                information: information(SHIFT_M, TURN_RAD),
+                is_loop: true,
+            }
+        })
+        .collect()
+}
+
+/// Adds the directions up of the scans of submaps, where they are known, to the equations of their poses, those from
+/// `first` on.
+pub fn keep_level(
+    drive: &Drive,
+    maps: &[Submap],
+    first: usize,
+    system: &mut BlockSystem,
+    poses: &[Pose3],
+) {
+    let Some(levels) = &drive.levels else {
+        return;
+    };
+    for (place, (map, pose)) in maps.iter().zip(&poses[first..]).enumerate() {
+        levels.add_to(
+            system,
+            (first + place, map.center),
+            pose,
+            map.rows.len() as f64,
+        );
+    }
 }
 
 /// Moves all poses with the centers of their submaps; the correction changes evenly from one to the next.

@@ -7,13 +7,13 @@ use smart_default::SmartDefault;
 use super::adjustment::{Adjusted, AdjustmentConfig, Held, adjust};
 use super::alignment::median;
 use super::anchors::{self, NotInMap, Placed, PlacementError};
-use super::block_system::BlockSystem;
 use super::config::{LoopConfig, OdometryConfig};
 use super::drive::{Drive, POINT_BYTES, SHORTER, Submap};
+use super::gnss::{self, GnssConstraints};
 use super::level::{Levelled, level};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
 use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
-use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
+use super::path_graph::{SUBMAP_LENGTH, keep_level, move_along, odometry_edges};
 use super::pose_graph::{Edge, optimize_with};
 use super::sampling::{Sample, sensor_range};
 use crate::geometry::{Pose3, TriangleMesh};
@@ -91,9 +91,9 @@ pub struct TrajectoryBuilder {
     samples: Vec<Sample>,
     ranges_m: Vec<f32>,
     given: Vec<Pose3>,
-    time_s: Option<f64>,
-    /// Time of the first scan [s].
-    first_s: Option<f64>,
+    /// Times of the scans, where they have one [s].
+    scan_times_s: Vec<Option<f64>>,
+    gnss: Option<GnssConstraints>,
     imu: Option<Imu>,
     /// Number of points of all samples.
     points: usize,
@@ -114,8 +114,8 @@ impl TrajectoryBuilder {
             samples: vec![],
             ranges_m: vec![],
             given: vec![],
-            time_s: None,
-            first_s: None,
+            scan_times_s: vec![],
+            gnss: None,
             imu: None,
             points: 0,
             memory_budget: MemoryBudget::default(),
@@ -141,6 +141,12 @@ impl TrajectoryBuilder {
         }
     }
 
+    /// Bends the path by fixes of a GNSS receiver, unless its poses are given; scans need times.
+    #[must_use]
+    pub fn with_gnss(self, gnss: Option<GnssConstraints>) -> Self {
+        Self { gnss, ..self }
+    }
+
     /// Registers the next scan, and keeps a sample of its points.
     ///
     /// # Errors
@@ -159,7 +165,7 @@ impl TrajectoryBuilder {
     /// Memory does not suffice.
     pub fn add_given(&mut self, scan: &Scan, map_from_lidar: Pose3) -> Result<(), MemoryError> {
         let last = self.given.last().unwrap_or(&map_from_lidar);
-        let times_s = self.time_s.zip(scan.time_s);
+        let times_s = self.scan_times_s.last().copied().flatten().zip(scan.time_s);
         self.estimates.push(OdometryEstimate {
             odom_from_lidar: map_from_lidar,
             previous_from_current: last.inverse() * map_from_lidar,
@@ -187,10 +193,7 @@ impl TrajectoryBuilder {
         self.points += sample.points.len();
         self.samples.push(sample);
         self.ranges_m.extend(range_m.map(|range_m| range_m as f32));
-        self.time_s = scan.time_s;
-        if self.samples.len() == 1 {
-            self.first_s = scan.time_s;
-        }
+        self.scan_times_s.push(scan.time_s);
         self.memory_budget.require(
             "the points of all scans",
             self.points as f64 * POINT_BYTES,
@@ -198,16 +201,18 @@ impl TrajectoryBuilder {
         )
     }
 
-    /// Closes loops, unless the poses are given, and adjusts the poses.
+    /// Closes loops and follows fixes, unless the poses are given, and adjusts the poses.
     ///
     /// # Errors
     /// Memory does not suffice.
     pub fn finish(mut self) -> Result<Trajectory, MemoryError> {
         let given = self.given.clone();
+        let times_s: Option<Vec<f64>> = self.scan_times_s.iter().copied().collect();
+        let gnss = self.gnss.take().zip(times_s);
         let is_given = !given.is_empty();
         let budget = self.memory_budget;
         let imu = self.imu.take().filter(|_| !is_given);
-        let first_s = self.first_s;
+        let first_s = self.scan_times_s.first().copied().flatten();
         let (config, mut trajectory, drive) = self.into_drive();
         let Some(mut drive) = drive else {
             return Ok(trajectory);
@@ -220,6 +225,12 @@ impl TrajectoryBuilder {
         }
         if config.loops && !is_given {
             trajectory.loops = close_loops(&mut drive, &trajectory.odometry, &config.loop_closure);
+        }
+        if let Some((gnss, times_s)) = gnss.filter(|_| !is_given) {
+            let (odometry, loops) = (&trajectory.odometry, &trajectory.loops);
+            if let Err(error) = gnss::bend(&mut drive, &times_s, odometry, loops, &gnss) {
+                tracing::warn!("the path does not follow the fixes of the receiver: {error}");
+            }
         }
         if config.adjust {
             let held = if is_given {
@@ -400,7 +411,7 @@ fn close(
     let optimized = (used.iter().any(Option::is_some))
         .then(|| {
             optimize_with(&centers, &edges, |system, poses| {
-                keep_level(drive, maps, system, poses)
+                keep_level(drive, maps, 0, system, poses)
             })
         })
         .flatten();
@@ -425,16 +436,6 @@ fn close(
         move_along(&mut drive.poses, maps, &centers, &optimized);
     }
     result
-}
-
-/// Adds the directions up of the scans of submaps, where they are known, to the equations of their poses.
-fn keep_level(drive: &Drive, maps: &[Submap], system: &mut BlockSystem, poses: &[Pose3]) {
-    let Some(levels) = &drive.levels else {
-        return;
-    };
-    for (place, (map, pose)) in maps.iter().zip(poses).enumerate() {
-        levels.add_to(system, (place, map.center), pose, map.rows.len() as f64);
-    }
 }
 
 #[cfg(test)]

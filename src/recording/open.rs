@@ -18,8 +18,8 @@ use super::scan_files;
 use super::scan_list::{self, ScanFile, Selection};
 use super::track::PoseTrack;
 use crate::geometry::Pose3;
-use crate::inertial::Imu;
 use crate::georeference::GeodeticFixes;
+use crate::inertial::Imu;
 use crate::lidar::{PointTiming, Scan};
 
 /// Revolutions per second of the sensor, for recordings without times.

@@ -8,6 +8,7 @@ use clap::Args;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::app::report::georeference::GeoreferenceReport;
 use crate::app::report::results::Value;
 use crate::app::report::{LocalizationResults, RunSummary};
 use crate::app::run::arguments::setting;
@@ -383,6 +384,8 @@ pub struct MapInfo {
     extent: Extent,
     /// Number of poses of the mapping drive; 0 in a map from elsewhere.
     path_poses: usize,
+    /// Its place on the Earth, where it is known.
+    georeference: Option<GeoreferenceReport>,
     /// Why its unit may not be the metre; `None` if its size is that of a place.
     unit_problem: Option<String>,
     /// Files that are kept next to the map; `None` where there are none.
@@ -446,7 +449,11 @@ fn map(file: &Path) -> Result<Printed> {
     let info = MapInfo {
         triangles: mesh.triangles.len(),
         extent: Extent::of(bounds),
-        path_poses: mapping_path.map_or(0, |path| path.map_from_lidar.len()),
+        path_poses: (mapping_path.as_ref()).map_or(0, |path| path.map_from_lidar.len()),
+        georeference: mapping_path
+            .and_then(|path| path.georeference)
+            .map(|it| GeoreferenceReport::of(&it))
+            .transpose()?,
         unit_problem: unit_doubt(&bounds),
         cache: CacheInfo::of(file),
     };
@@ -459,6 +466,7 @@ fn map(file: &Path) -> Result<Printed> {
         ("extent", info.extent.to_string()),
         ("path", path),
     ];
+    rows.extend(info.georeference.iter().flat_map(GeoreferenceReport::rows));
     rows.extend(info.unit_problem.iter().map(|it| ("unit", it.clone())));
     rows.extend(info.cache.iter().map(|it| ("cache", it.in_words())));
     Printed::rows(&rows, &info)

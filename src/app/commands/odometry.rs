@@ -9,14 +9,22 @@ use serde::Serialize;
 use super::stages::{RecordingInputs, infer};
 use super::trajectory;
 use crate::app::report::RunFiles;
+use crate::app::report::georeference::GeoreferenceReport;
 use crate::app::report::odometry::{self, OdometryReport};
+use crate::app::report::run_output::stamped;
 use crate::app::run::{
     Claims, Context, Outputs, Printed, RecordingArgs, RunArgs, input, memory, output,
 };
 use crate::app::settings::OdometryCommandConfig;
+use crate::geometry::Pose3;
+use crate::georeference::{AlignedPath, PathOverTime, align, write_geojson};
 use crate::mapping::{LostPath, check_path, find_poses};
-use crate::recording::Recording;
+use crate::odometry::{GnssConstraints, Trajectory};
+use crate::recording::{Frame, Recording};
 use crate::sensor::{Sensor, SensorConfig};
+
+/// Path on the Earth, where positions of a receiver are given.
+const GEOJSON: &str = "poses.geojson";
 
 /// Arguments of `odometry`.
 #[derive(Clone, Debug, Args, Serialize)]
@@ -39,6 +47,11 @@ pub struct OdometryArgs {
     #[arg(long = "poses", value_name = "FILE")]
     pub pose_file: Option<PathBuf>,
 
+    /// Positions of a GNSS receiver that the poses follow: sentences of NMEA, rows of time, latitude, longitude and height, a
+    /// folder oxts, or a topic of the bag; sets the key `gnss_file`.
+    #[arg(long = "gnss", value_name = "SOURCE")]
+    pub gnss_file: Option<PathBuf>,
+
     /// Calibration of the camera whose poses these are; sets the key `calib_file`.
     #[arg(long = "calib", value_name = "FILE")]
     pub calib_file: Option<PathBuf>,
@@ -54,6 +67,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     let mut claims = prepare(config, context)?;
     let mut resolved = config.clone();
     let (recording, sensor) = open(&mut resolved)?;
+    let gnss = config.gnss.read(&recording)?;
     let frames = recording.dense_frames();
     let is_given = recording.track.is_some();
     config.inertial.warn_unless(!is_given);
@@ -65,6 +79,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
             is_given,
             imu,
             &config.trajectory,
+            gnss.as_ref(),
             memory::budget(),
             on_event,
         )
@@ -82,15 +97,45 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
         &rows,
         &found,
     )?;
+    let aligned = gnss
+        .map(|gnss| aligned(&frames, &found, &gnss))
+        .transpose()?;
+    if let Some(aligned) = &aligned {
+        let poses: Vec<Pose3> = rows.iter().map(|&row| found.poses[row]).collect();
+        let path = [stamped(&recording.frames, &poses)];
+        output::write_file(&folder.join(GEOJSON), |file| {
+            write_geojson(file, &aligned.georeference, &path)
+        })?;
+    }
     if config.output.plots {
         odometry::draw(&folder.join("path.png"), &found, is_given)?;
     }
-    let report = OdometryReport::new(&found, &frames, recording.has_times, sensor);
+    let mut report = OdometryReport::new(&found, &frames, recording.has_times, sensor);
+    report.georeference = (aligned.as_ref())
+        .map(GeoreferenceReport::new)
+        .transpose()?;
     output::write_yaml(&folder.join("effective_odometry.yml"), &resolved)?;
     output::write_json(&main, &report)?;
     claims.finish(&main)?;
     odometry::warn(&report.summary, LostPath::of(&found, &frames).as_ref());
-    Printed::rows(&odometry::rows(&report.summary), &report)
+    let mut rows = odometry::rows(&report.summary);
+    rows.extend(
+        report
+            .georeference
+            .iter()
+            .flat_map(GeoreferenceReport::rows),
+    );
+    Printed::rows(&rows, &report)
+}
+
+/// The place of the path on the Earth.
+fn aligned(frames: &[Frame], found: &Trajectory, gnss: &GnssConstraints) -> Result<AlignedPath> {
+    let times_s: Vec<f64> = frames.iter().map(|frame| frame.time_s).collect();
+    let path = PathOverTime {
+        times_s: &times_s,
+        map_from_lidar: &found.poses,
+    };
+    Ok(align(path, &gnss.fixes, &gnss.config)?)
 }
 
 fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> {
@@ -102,9 +147,11 @@ fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> 
         "frames.csv",
         "effective_odometry.yml",
     ];
+    names.extend(config.gnss.gnss_file.as_ref().map(|_| GEOJSON));
     names.extend(config.output.plots.then_some("path.png"));
     let mut inputs = RecordingInputs::new(&config.recording, &config.given_poses).files();
     inputs.extend(config.inertial.files(&config.recording));
+    inputs.extend(config.gnss.file(&config.recording));
     input::require(&inputs)?;
     inputs.extend(context.input());
     let outputs = Outputs {

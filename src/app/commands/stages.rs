@@ -7,11 +7,12 @@ use anyhow::{Context as _, Result};
 use crate::app::run::input::is_bag;
 use crate::app::run::{Context, input, memory};
 use crate::app::settings::{
-    InertialConfig, MapInputConfig, MotionSourceConfig, OdometrySource, PoseInputConfig,
-    RecordingConfig,
+    GnssInputConfig, InertialConfig, MapInputConfig, MotionSourceConfig, OdometrySource,
+    PoseInputConfig, RecordingConfig,
 };
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
-use crate::recording::{PoseTrack, Recording, is_topic};
+use crate::odometry::GnssConstraints;
+use crate::recording::{PoseTrack, Recording, RecordingError, is_topic};
 use crate::sensor::{Sensor, SensorConfig};
 
 /// A recording, and the poses that are given with it.
@@ -107,6 +108,34 @@ impl PoseInputConfig {
     }
 }
 
+impl GnssInputConfig {
+    /// The file and its key, if it is not a topic of the bag.
+    pub fn file(&self, recording: &RecordingConfig) -> Option<(&'static str, &Path)> {
+        let path = self.gnss_file.as_deref()?;
+        let is_in_bag = is_topic(path) && is_bag(&recording.scan_folder);
+        (!is_in_bag).then_some(("gnss_file", path))
+    }
+
+    /// Reads the positions of a recording, where there are some.
+    pub fn read(&self, recording: &Recording) -> Result<Option<GnssConstraints>, RecordingError> {
+        let Some(path) = &self.gnss_file else {
+            return Ok(None);
+        };
+        let fixes = recording.read_fixes(path)?;
+        tracing::info!(
+            "{}: {} fixes, {} messages without a position, {} damaged lines",
+            path.display(),
+            fixes.fixes.len(),
+            fixes.without_position,
+            fixes.bad_lines
+        );
+        Ok(Some(GnssConstraints {
+            fixes,
+            config: self.errors.clone(),
+        }))
+    }
+}
+
 /// Completes what is known about the sensor by what the scans show; returns the recording, whose points have times if they
 /// are known.
 pub fn infer(known: &mut SensorConfig, recording: Recording) -> Result<(Recording, Sensor)> {
@@ -181,7 +210,7 @@ impl MapInputConfig {
         Ok(Some(MappingPath {
             world_from_map: track.world_from_map,
             map_from_lidar: track.map_from_lidar,
-            sensor: None,
+            ..MappingPath::default()
         }))
     }
 

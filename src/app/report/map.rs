@@ -8,6 +8,7 @@ use anyhow::Result;
 use schemars::JsonSchema;
 use serde::Serialize;
 
+use super::georeference::GeoreferenceReport;
 use super::odometry;
 use super::plotting::{MapPlot, SURFACES, VertexNumbers, muted};
 use super::run_output::MOST_TRIANGLES;
@@ -33,6 +34,8 @@ pub struct BuildReport {
     pub sensor: Option<Sensor>,
     /// What poses that were found in this run show about themselves.
     pub trajectory: Option<TrajectorySummary>,
+    /// The place of the map on the Earth, where fixes of a receiver were given.
+    pub georeference: Option<GeoreferenceReport>,
     /// What changed in the older map, where there is one.
     pub changes: Option<ChangesReport>,
     /// Length of the path of the mapped scans of this drive [m].
@@ -114,6 +117,7 @@ impl BuildReport {
             rows.splice(2..2, older.map(|older| ("older path", older)));
         }
         rows.extend(self.changes.iter().flat_map(ChangesReport::rows));
+        rows.extend(self.georeference.iter().flat_map(GeoreferenceReport::rows));
         rows.extend(self.quality_rows());
         if let Some(summary) = &self.trajectory {
             let found = odometry::rows(summary).into_iter();

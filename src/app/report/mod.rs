@@ -5,6 +5,7 @@ pub mod results;
 pub mod run_output;
 pub mod run_page;
 // Of the other commands.
+pub mod georeference;
 pub mod ground;
 pub mod map;
 pub mod odometry;

@@ -6,6 +6,7 @@ use anyhow::Result;
 use schemars::JsonSchema;
 use serde::Serialize;
 
+use super::georeference::GeoreferenceReport;
 use super::plotting::PathPlot;
 use super::plotting::color::{ODOMETRY, REFINED};
 use super::results::{FrameTable, write_trajectory_npz};
@@ -26,6 +27,8 @@ pub struct OdometryReport {
     pub summary: TrajectorySummary,
     /// The sensor.
     sensor: Sensor,
+    /// The place of the first scan on the Earth, where fixes of a receiver were given.
+    pub georeference: Option<GeoreferenceReport>,
     /// Loops that were found.
     found_loops: Vec<LoopReport>,
 }
@@ -53,6 +56,7 @@ impl OdometryReport {
             found_loops: loops.map(|it| LoopReport::of(it, frames)).collect(),
             summary: TrajectorySummary::new(found, has_times),
             sensor,
+            georeference: None,
         }
     }
 }

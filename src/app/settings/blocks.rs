@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::geometry::{Pose3, pose_from_degrees};
+use crate::georeference::GnssConfig;
 use crate::recording::{Layout, Selection};
 use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 
@@ -111,6 +112,24 @@ impl Validate for InertialConfig {
             in_range("lidar_from_imu", *deg, -360.0..=360.0)?;
         }
         Ok(())
+    }
+}
+
+/// Positions of a GNSS receiver.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct GnssInputConfig {
+    /// Sentences of NMEA, rows of time, latitude, longitude and height, a folder `oxts`, or a topic of a bag; `None`: none
+    /// are used.
+    pub gnss_file: Option<PathBuf>,
+    /// Their errors, and the place of the antenna.
+    pub errors: GnssConfig,
+}
+
+impl Validate for GnssInputConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        optional_path("gnss_file", self.gnss_file.as_deref())?;
+        nested("errors", &self.errors)
     }
 }
 

@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{
-    InertialConfig, OutputConfig, PoseInputConfig, RecordingConfig, optional_path, require_path,
+    GnssInputConfig, InertialConfig, OutputConfig, PoseInputConfig, RecordingConfig, optional_path,
+    require_path,
 };
 use crate::map::{MapConfig, PoseSource};
 use crate::validation::{InvalidValue, Validate, nested, require};
@@ -22,6 +23,8 @@ pub struct BuildMapConfig {
     pub given_poses: PoseInputConfig,
     /// Its inertial sensor, where it is used.
     pub inertial: InertialConfig,
+    /// Positions of a GNSS receiver, which give the map its place on the Earth; poses from the scans follow them.
+    pub gnss: GnssInputConfig,
     /// Output path of the map.
     #[default("results/map.ply".into())]
     pub mesh_file: PathBuf,
@@ -45,6 +48,7 @@ impl Validate for BuildMapConfig {
         nested("recording", &self.recording)?;
         nested("given_poses", &self.given_poses)?;
         nested("inertial", &self.inertial)?;
+        nested("gnss", &self.gnss)?;
         optional_path("cloud_file", self.cloud_file.as_deref())?;
         optional_path("truth_mesh", self.truth_mesh.as_deref())?;
         optional_path("onto", self.onto.as_deref())?;

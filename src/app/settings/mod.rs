@@ -22,8 +22,8 @@ mod load;
 mod tests;
 
 pub use blocks::{
-    InertialConfig, MapInputConfig, MotionSourceConfig, NPZ, OdometrySource, OutputConfig,
-    PoseInputConfig, RecordingConfig, is_result, require_path,
+    GnssInputConfig, InertialConfig, MapInputConfig, MotionSourceConfig, NPZ, OdometrySource,
+    OutputConfig, PoseInputConfig, RecordingConfig, is_result, require_path,
 };
 pub use build_map::BuildMapConfig;
 pub use evaluation::EvaluationConfig;

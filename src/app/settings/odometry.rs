@@ -6,7 +6,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::blocks::{InertialConfig, OutputConfig, PoseInputConfig, RecordingConfig, require_path};
+use super::blocks::{
+    GnssInputConfig, InertialConfig, OutputConfig, PoseInputConfig, RecordingConfig, require_path,
+};
 use crate::odometry::TrajectoryConfig;
 use crate::sensor::MotionCompensation;
 use crate::validation::{InvalidValue, Validate, nested, positive};
@@ -21,6 +23,8 @@ pub struct OdometryCommandConfig {
     pub given_poses: PoseInputConfig,
     /// Its inertial sensor, where it is used.
     pub inertial: InertialConfig,
+    /// Positions of a GNSS receiver, which poses from the scans follow.
+    pub gnss: GnssInputConfig,
     /// Folder of the poses, the report and the picture.
     #[default("results/odometry".into())]
     pub output_folder: PathBuf,
@@ -41,6 +45,7 @@ impl Validate for OdometryCommandConfig {
         nested("recording", &self.recording)?;
         nested("given_poses", &self.given_poses)?;
         nested("inertial", &self.inertial)?;
+        nested("gnss", &self.gnss)?;
         require_path("output_folder", &self.output_folder)?;
         positive("max_step_m", self.max_step_m)?;
         nested("trajectory", &self.trajectory)

@@ -121,7 +121,7 @@ impl Crossing {
         let path = MappingPath {
             world_from_map: Pose3::identity(),
             map_from_lidar: upper_drive().into_iter().chain(lower_drive()).collect(),
-            sensor: None,
+            ..MappingPath::default()
         };
         let tiles = TileGrid::around(&path.map_from_lidar, &TileConfig::default());
         let renderer = CpuRenderer::new(std::slice::from_ref(&mesh));

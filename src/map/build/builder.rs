@@ -395,6 +395,7 @@ impl MapPlan<'_> {
         let path = MappingPath {
             world_from_map: Pose3::identity(),
             map_from_lidar: self.map_from_lidar,
+            georeference: None,
             sensor: Some(self.scan.sensor),
         };
         Ok(Map::new(mesh, path, &self.builder.options)?)
@@ -556,7 +557,7 @@ mod tests {
         map.path = MappingPath {
             world_from_map,
             map_from_lidar: vec![world_from_map.inverse(); 3],
-            sensor: None,
+            ..MappingPath::default()
         }
         .into();
         let folder = tempfile::tempdir().unwrap();

@@ -1,11 +1,12 @@
 //! The path and the sensor of the mapping drive, and the frame of the map, stored with the map.
 //!
-//! In the PLY file they are comments, which all mesh readers skip: one for the sensor, as JSON, one for the frame, and one
-//! per pose, each a translation [m] and a unit quaternion with all digits, so that reading gives the same bits.
+//! In the PLY file they are comments, which all mesh readers skip: one for the sensor and one for the place on the Earth, as
+//! JSON, one for the frame, and one per pose, each a translation [m] and a unit quaternion with all digits, so that reading gives the same bits.
 //!
 //! ```text
 //! comment fpmcl sensor           {"range_image":{"height":64, ...
 //! comment fpmcl world_from_map   tx ty tz qx qy qz qw
+//! comment fpmcl georeference     {"latitude_deg":49.011, ...
 //! comment fpmcl map_from_lidar   tx ty tz qx qy qz qw
 //! ```
 
@@ -13,10 +14,13 @@ use glam::DVec3;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
 use crate::geometry::{FARTHEST_M, Pose3};
+use crate::georeference::Georeference;
 use crate::sensor::Sensor;
+use crate::validation::Validate as _;
 
 const WORLD: &str = "fpmcl world_from_map";
 const SENSOR: &str = "fpmcl sensor ";
+const GEOREFERENCE: &str = "fpmcl georeference ";
 const POSE: &str = "fpmcl map_from_lidar";
 
 /// Poses of the scans that a map was built from, and the pose of the map in the world.
@@ -29,6 +33,8 @@ pub struct MappingPath {
     pub map_from_lidar: Vec<Pose3>,
     /// Sensor of these scans; `None` for a mesh from elsewhere.
     pub sensor: Option<Sensor>,
+    /// Place of the map on the Earth, where it is known.
+    pub georeference: Option<Georeference>,
 }
 
 /// A comment of a map that cannot be read.
@@ -45,10 +51,12 @@ impl MappingPath {
             format!("{key} {x} {y} {z} {} {} {} {}", q.i, q.j, q.k, q.w)
         };
         let sensor = self.sensor.iter().flat_map(serde_json::to_string);
+        let georeference = self.georeference.iter().flat_map(serde_json::to_string);
         let poses = self.map_from_lidar.iter().map(|pose| line(POSE, pose));
         sensor
             .map(|json| format!("{SENSOR}{json}"))
             .chain(std::iter::once(line(WORLD, &self.world_from_map)))
+            .chain(georeference.map(|json| format!("{GEOREFERENCE}{json}")))
             .chain(poses)
             .collect()
     }
@@ -80,6 +88,8 @@ impl MappingPath {
             } else if let Some(numbers) = comment.strip_prefix(POSE) {
                 let path = path.get_or_insert_default();
                 path.map_from_lidar.push(pose(numbers, comment)?);
+            } else if let Some(json) = comment.strip_prefix(GEOREFERENCE) {
+                path.get_or_insert_default().georeference = georeference(json);
             } else if let Some(json) = comment.strip_prefix(SENSOR) {
                 let sensor = serde_json::from_str(json);
                 let sensor = sensor.inspect_err(|error| {
@@ -90,6 +100,20 @@ impl MappingPath {
         }
         Ok(path)
     }
+}
+
+/// The place of a map on the Earth; `None`, with a warning, where it cannot be read.
+fn georeference(json: &str) -> Option<Georeference> {
+    let read: Result<Georeference, _> = serde_json::from_str(json);
+    let problem = match read {
+        Ok(read) => match read.validate() {
+            Ok(()) => return Some(read),
+            Err(error) => error.to_string(),
+        },
+        Err(error) => error.to_string(),
+    };
+    tracing::warn!("the georeference of the map is not read: {problem}");
+    None
 }
 
 fn pose(numbers: &str, comment: &str) -> Result<Pose3, BadPathComment> {
@@ -122,6 +146,7 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
+    use crate::georeference::{HeightReference, UtmZone};
 
     fn path() -> MappingPath {
         let pose = |i: i32| {
@@ -135,7 +160,48 @@ mod tests {
             world_from_map: pose(7),
             map_from_lidar: (0..5).map(pose).collect(),
             sensor: Some(Sensor::vlp16()),
+            georeference: Some(georeferenced()),
         }
+    }
+
+    fn georeferenced() -> Georeference {
+        Georeference {
+            latitude_deg: 49.0 + 1.0 / 3.0,
+            longitude_deg: -8.4,
+            height_m: 110.1,
+            height_above: HeightReference::MeanSeaLevel,
+            roll_deg: 0.1,
+            pitch_deg: -0.2,
+            yaw_deg: 100.0 / 3.0,
+            utm: UtmZone {
+                number: 29,
+                is_south: false,
+            },
+            horizontal_m: 0.3,
+            vertical_m: 0.7,
+            heading_deg: 0.05,
+        }
+    }
+
+    #[test]
+    fn a_georeference_that_is_not_on_the_earth_is_left_out() {
+        let json = |georeference: &Georeference| {
+            let json = serde_json::to_string(georeference).unwrap();
+            let line = format!("{GEOREFERENCE}{json}");
+            MappingPath::from_comments([line.as_str()])
+                .unwrap()
+                .unwrap()
+                .georeference
+        };
+        assert_eq!(json(&georeferenced()), Some(georeferenced()));
+        let beyond_the_pole = Georeference {
+            latitude_deg: 91.0,
+            ..georeferenced()
+        };
+        assert_eq!(json(&beyond_the_pole), None);
+        let mut zone = georeferenced();
+        zone.utm.number = 61;
+        assert_eq!(json(&zone), None);
     }
 
     #[test]

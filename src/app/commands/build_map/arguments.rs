@@ -37,6 +37,11 @@ pub struct BuildMapArgs {
     #[arg(long = "imu", value_name = "FILE")]
     pub imu_file: Option<PathBuf>,
 
+    /// Positions of a GNSS receiver, which give the map its place on the Earth: sentences of NMEA, rows of time, latitude,
+    /// longitude and height, a folder oxts, or a topic of the bag; sets the key `gnss_file`.
+    #[arg(long = "gnss", value_name = "SOURCE")]
+    pub gnss_file: Option<PathBuf>,
+
     /// Map to which the recording is added: it is localized there, and what has changed is replaced. Sets the key `onto`.
     #[arg(long, value_name = "MAP")]
     pub onto: Option<PathBuf>,

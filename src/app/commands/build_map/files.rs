@@ -26,6 +26,7 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
     if config.cloud_file.is_none() {
         inputs.extend(RecordingInputs::new(&config.recording, &config.given_poses).files());
         inputs.extend(config.inertial.files(&config.recording));
+        inputs.extend(config.gnss.file(&config.recording));
     }
     let optional = [
         ("cloud_file", &config.cloud_file),

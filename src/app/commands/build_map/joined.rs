@@ -30,12 +30,17 @@ impl<'a> JoinedMap<'a> {
             world_from_map: opened.sequence.world().0,
             map_from_lidar: poses.clone(),
             sensor: Some(opened.sensor.clone()),
+            georeference: None,
         };
+        let mut path = older.map_or_else(new, |older| older.path.extended_by(&poses));
+        if let Some(found) = &opened.georeferenced {
+            path.georeference = Some(found.georeference.clone());
+        }
         Self {
             older: older.map(|it| (it, Without::new(&*it.mesh, &joined.gone))),
             gone: &joined.gone,
             added: joined.meshes.iter().map(|mesh| mesh as _).collect(),
-            path: older.map_or_else(new, |older| older.path.extended_by(&poses)),
+            path,
         }
     }
 

@@ -19,6 +19,7 @@ use anyhow::{Result, ensure};
 pub use self::arguments::{BuildMapArgs, BuildPart};
 use self::joined::JoinedMap;
 use self::parts::Role;
+use crate::app::report::georeference::GeoreferenceReport;
 use crate::app::report::map::{BuildReport, draw_changes, draw_map};
 use crate::app::run::{Context, Printed};
 use crate::app::settings::BuildMapConfig;
@@ -70,6 +71,9 @@ fn run_with_scans(config: &BuildMapConfig, role: Role, context: &Context) -> Res
         held_out_frames: opened.held_out.len(),
         sensor: Some(opened.sensor.clone()),
         trajectory: opened.trajectory.clone(),
+        georeference: (opened.georeferenced.as_ref())
+            .map(GeoreferenceReport::new)
+            .transpose()?,
         changes: map.changes(),
         stage_seconds: progress.finish(),
         quality: residuals.quality(),

@@ -12,9 +12,10 @@ use super::poses;
 use crate::app::commands::trajectory::poses_next_to;
 use crate::app::run::{Claims, Context, version};
 use crate::app::settings::{self, BuildMapConfig, OutputConfig};
+use crate::georeference::AlignedPath;
 use crate::map::build::plan::{self, LocalMapPlan};
 use crate::map::{MapBuilder, MapPlan};
-use crate::mapping::{PoseSearch, TrajectorySummary, key_frames, poses_of};
+use crate::mapping::{PoseSearch, TrajectorySummary, georeferenced, key_frames, poses_of};
 use crate::recording::{Frame, Recording};
 use crate::sensor::Sensor;
 
@@ -28,6 +29,8 @@ pub struct Opened {
     pub sensor: Sensor,
     /// What the poses show about themselves, where they were found in this run.
     pub trajectory: Option<TrajectorySummary>,
+    /// The place of the map on the Earth, where fixes of a receiver are given.
+    pub georeferenced: Option<AlignedPath>,
     /// The map to which the recording is added.
     pub older: Option<OlderMap>,
     /// The key scans that build the map.
@@ -51,16 +54,21 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let (older, older_map) = older::open(&config, context)?.unzip();
     let recording = poses::open(&config, older.as_ref())?;
     let (mut sequence, sensor) = poses::check(recording, &mut config)?;
+    let gnss = config.gnss.read(&sequence)?;
     let mut trajectory = None;
     let is_level = sequence.track.is_none() && older.is_none();
     config.inertial.warn_unless(is_level);
     if PoseSearch::is_needed(&sequence, &config.map) {
         let has_times = sequence.has_times;
         let search = PoseSearch::new(sequence, &sensor, older_map.as_ref(), &config.map);
-        let localized_by = older.as_ref().map_or_else(String::new, |older| {
+        let search = search.with_gnss(gnss.as_ref());
+        let mut localized_by = older.as_ref().map_or_else(String::new, |older| {
             let map = &config.map;
             format!("{}{sensor:?}{:?}{}", older.hash, map.ground, map.seed)
         });
+        if let Some(gnss) = &gnss {
+            write!(localized_by, "{gnss:?}")?;
+        }
         let found = poses::find(search, has_times, &config, &localized_by, role, context)?;
         (sequence, trajectory) = (found.0, Some(found.1));
     } else if let Some(name) = poses_next_to(&config.mesh_file).file_name()
@@ -68,6 +76,9 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     {
         claims.remove(&[&name.to_string_lossy()])?;
     }
+    let georeferenced = gnss
+        .map(|gnss| georeferenced(&sequence, &gnss))
+        .transpose()?;
     let sequence = sequence.compensated_by_poses();
     let (mapped, held_out) = hold_out(&sequence.frames, &config);
     parts.keep_those_of(&inputs_of(&config, &mapped, older.as_ref())?)?;
@@ -78,6 +89,7 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
         held_out,
         sensor,
         trajectory,
+        georeferenced,
         older,
         parts,
     };
