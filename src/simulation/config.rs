@@ -8,6 +8,7 @@ use smart_default::SmartDefault;
 use super::centreline::PathSegment;
 use super::ego_motion::MotionConfig;
 use super::given_poses::GivenPosesConfig;
+use super::gnss::SimulatedGnssConfig;
 use super::inertial::SimulatedImuConfig;
 use super::odometry::SimulatedOdometryConfig;
 use super::scanner::ScannerConfig;
@@ -56,6 +57,8 @@ pub struct SimulationConfig {
     pub given_poses: GivenPosesConfig,
     /// The inertial sensor.
     pub imu: SimulatedImuConfig,
+    /// The GNSS receiver whose positions are written next to the true poses.
+    pub gnss: SimulatedGnssConfig,
 }
 
 impl SimulationConfig {
@@ -83,7 +86,8 @@ impl Validate for SimulationConfig {
         nested("scanner", &self.scanner)?;
         nested("odometry", &self.odometry)?;
         nested("given_poses", &self.given_poses)?;
-        nested("imu", &self.imu)
+        nested("imu", &self.imu)?;
+        nested("gnss", &self.gnss)
     }
 }
 

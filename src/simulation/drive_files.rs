@@ -6,6 +6,7 @@
 //! calib.txt times.txt odometry.txt
 //! imu.csv                         only where the configuration has an inertial sensor
 //! given_poses.txt poses_in_map.txt    only where the configuration gives poses with errors
+//! gnss.csv                        only where there is a receiver
 //! poses.txt                       written last
 //! ```
 
@@ -17,6 +18,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
+use super::gnss::write_fixes;
 use super::{Simulation, calibration};
 use crate::files::write_atomically;
 use crate::geometry::Pose3;
@@ -35,6 +37,7 @@ pub const POSES_IN_MAP_FILE: &str = "poses_in_map.txt";
 const CALIBRATION_FILE: &str = "calib.txt";
 const TIMES_FILE: &str = "times.txt";
 const IMU_FILE: &str = "imu.csv";
+const GNSS_FILE: &str = "gnss.csv";
 
 /// A file of a drive that cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -73,6 +76,8 @@ impl Simulation {
         let poses = self.tables().into_iter().map(|(name, _)| name);
         let imu = self.config.imu.grade.map(|_| IMU_FILE);
         let tables = [CALIBRATION_FILE, TIMES_FILE].into_iter().chain(imu);
+        let gnss = self.config.gnss.is_on().then_some(GNSS_FILE);
+        let tables = tables.chain(gnss);
         let tables = tables.chain(poses);
         let scans = (0..self.frames()).flat_map(|frame| scan_files(folder, frame));
         tables.map(|name| folder.join(name)).chain(scans).collect()
@@ -115,7 +120,7 @@ impl Simulation {
         Ok([done.into_inner(), kept.into_inner()])
     }
 
-    /// Writes calibration, times, odometry and, last, the poses.
+    /// Writes calibration, times, fixes, odometry and, last, the poses.
     pub fn write_tables(&self, folder: &Path) -> Result<(), DriveFileError> {
         // The frame of the poses is the world frame of the street.
         let frame = MapFrame {
@@ -131,6 +136,11 @@ impl Simulation {
         if self.config.imu.grade.is_some() {
             let samples = self.imu_samples();
             write(&folder.join(IMU_FILE), |file| write_table(file, &samples))?;
+        }
+        if self.config.gnss.is_on() {
+            write(&folder.join(GNSS_FILE), |file| {
+                write_fixes(file, &self.fixes().map_err(io::Error::other)?)
+            })?;
         }
         for (name, poses) in self.tables() {
             let poses = poses(self);

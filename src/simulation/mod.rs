@@ -34,6 +34,7 @@ mod config;
 pub mod drive_files;
 mod ego_motion;
 mod given_poses;
+mod gnss;
 mod inertial;
 mod odometry;
 mod scanner;
@@ -52,6 +53,7 @@ pub use centreline::{Centreline, CentrelinePoint, PathSegment};
 pub use config::{SimulationConfig, SimulationError};
 pub use ego_motion::{EgoMotion, MotionConfig, SCAN_PERIOD_S};
 pub use given_poses::GivenPosesConfig;
+pub use gnss::SimulatedGnssConfig;
 pub use ground::{GroundField, GroundSample, GroundZone};
 pub use inertial::{ImuGrade, SimulatedImuConfig};
 pub use odometry::SimulatedOdometryConfig;
@@ -63,6 +65,7 @@ pub use structure::Structure;
 pub use traffic::TrafficConfig;
 
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
+use crate::georeference::{GeodeticFix, ProjectionError};
 use crate::inertial::ImuSample;
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::random::Generator;
@@ -193,6 +196,17 @@ impl Simulation {
         let config = &self.config.given_poses;
         let given = config.without_noise(&delayed, &mut self.given_stream(1));
         bent_poses(&self.poses(), &mapped, &given)
+    }
+
+    /// The positions that the receiver reports.
+    ///
+    /// # Errors
+    /// None on the Earth.
+    pub fn fixes(&self) -> Result<Vec<GeodeticFix>, ProjectionError> {
+        let rng = stream(self.config.seed, Purpose::Gnss, self.config.drive.into());
+        let last_s = self.times_s().last().copied().unwrap_or_default();
+        let pose = |time_s| self.world_from_lidar(time_s);
+        gnss::fixes(&self.config.gnss, last_s, pose, rng)
     }
 
     fn given_stream(&self, drive: u32) -> Generator {

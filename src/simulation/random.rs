@@ -21,6 +21,7 @@ pub(super) enum Purpose {
     Change = 12,
     GivenPoses = 13,
     Imu = 14,
+    Gnss = 15,
 }
 
 /// Stream number `index` of a purpose: the only source of generators in this module.
