@@ -21,13 +21,16 @@ use crate::app::report::{LocalizationResults, run_output};
 use crate::app::run::{Claims, Context, Outputs, Printed, input, output};
 use crate::app::settings::{self, RefinementConfig};
 use crate::evaluation::planar_errors;
-use crate::geometry::{Pose3, TriangleMesh, pose2_from_pose3};
+use crate::geometry::{Pose3, StampedPose, TriangleMesh, pose2_from_pose3};
+use crate::georeference::write_geojson;
+use crate::map::MappingPath;
 use crate::map::files::mesh_file;
 use crate::recording::{Frame, scan_files};
 
 /// First bytes of the files.
 const MCAP: &[u8] = b"\x89MCAP0\r\n";
 const GLB: &[u8] = b"glTF";
+const GEOJSON: &[u8] = b"{";
 
 /// What was written.
 #[derive(Debug, Default, Serialize, JsonSchema)]
@@ -71,10 +74,11 @@ pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
 /// Checks and claims the files to write.
 pub fn check(args: &ExportArgs, context: &Context) -> Result<Vec<(Claims, PathBuf)>> {
     let metadata = args.pcd.as_deref().map(tiles::metadata_file);
-    let formats: [(_, _, _, &[&str]); 3] = [
+    let formats: [(_, _, _, &[&str]); 4] = [
         ("--mcap", &args.mcap, Some(MCAP), &[]),
         ("--glb", &args.glb, Some(GLB), &[]),
         ("--pcd", &metadata, None, &[TILES_FOLDER]),
+        ("--geojson", &args.geojson, Some(GEOJSON), &[]),
     ];
     let base = refine::base_config(Some(&args.input));
     let map = args.map.as_deref().unwrap_or(&base.map_input.map_file);
@@ -115,7 +119,7 @@ fn export_map(args: &ExportArgs, context: &Context) -> Result<Option<TilesReport
     );
     ensure!(
         args.mcap.is_none(),
-        "{path} is a map: a log is written of a result (.npz); give --glb FILE or --pcd FOLDER"
+        "{path} is a map: a log is written of a result (.npz); give --glb FILE, --pcd FOLDER or --geojson FILE"
     );
     let (mesh, path) = mesh_file::read(&args.input)?;
     if args.glb.is_some() {
@@ -123,7 +127,34 @@ fn export_map(args: &ExportArgs, context: &Context) -> Result<Option<TilesReport
         model.add_mesh("map", &mesh);
         write_model(args, &model)?;
     }
+    if let Some(file) = &args.geojson {
+        let driven = path.as_ref().map_or(&[][..], |it| &it.map_from_lidar);
+        let row = |(frame, &map_from_lidar): (usize, &Pose3)| StampedPose {
+            frame,
+            time_s: frame as f64,
+            map_from_lidar,
+        };
+        let driven = driven.iter().enumerate().map(row).collect();
+        write_path(file, &args.input, path.as_ref(), &[driven])?;
+    }
     tiles::write(args, &mesh, path.as_ref(), context)
+}
+
+/// Writes a path in a map as one on the Earth.
+fn write_path(
+    file: &Path,
+    map: &Path,
+    path: Option<&MappingPath>,
+    stretches: &[Vec<StampedPose>],
+) -> Result<()> {
+    let georeference = path.and_then(|path| path.georeference.as_ref());
+    let georeference = georeference.with_context(|| {
+        format!(
+            "the place of {} on the Earth is not known; build it with --gnss SOURCE",
+            map.display()
+        )
+    })?;
+    output::write_file(file, |file| write_geojson(file, georeference, stretches))
 }
 
 /// Exports a result with its map; returns the tiles of the map, if they are requested.
@@ -158,6 +189,10 @@ fn export_result(args: &ExportArgs, context: &Context) -> Result<Option<TilesRep
         };
         write_log(log, &run, context)?;
     }
+    if let Some(file) = &args.geojson {
+        let stretches = stretches_of(&results)?;
+        write_path(file, &config.map_input.map_file, path.as_ref(), &stretches)?;
+    }
     tiles::write(args, &mesh, path.as_ref(), context)
 }
 
@@ -189,13 +224,33 @@ fn frames_of(config: &mut RefinementConfig, results: &LocalizationResults) -> Re
     Ok(frames)
 }
 
-/// The map with the path, colored by its error where there is a truth.
-fn model_of(mesh: &TriangleMesh, results: &LocalizationResults) -> Result<Model> {
+/// The best trajectory of a result where it is trusted: the refined one, if there is one.
+fn stretches_of(results: &LocalizationResults) -> Result<Vec<Vec<StampedPose>>> {
+    let (found, trusted) = best_of(results)?;
+    let times_s = results.times_s.as_deref();
+    let row = |row: usize| StampedPose {
+        frame: results.frames[row],
+        time_s: times_s.map_or(row as f64, |times_s| times_s[row]),
+        map_from_lidar: found[row],
+    };
+    Ok(stretches(&trusted)
+        .map(|rows| rows.map(row).collect())
+        .collect())
+}
+
+/// The best trajectory of a result, and whether each of its poses is trusted.
+fn best_of(results: &LocalizationResults) -> Result<(&[Pose3], Vec<bool>)> {
     let (found, trusted) = match &results.refined_in_space {
         Some(refined) => (Some(refined), results.refined_trusted()),
         None => (results.trajectory_in_space(), results.trusted()),
     };
     let found = found.context("the result holds no poses in space; run localize again")?;
+    Ok((&found[..], trusted))
+}
+
+/// The map with the path, colored by its error where there is a truth.
+fn model_of(mesh: &TriangleMesh, results: &LocalizationResults) -> Result<Model> {
+    let (found, trusted) = best_of(results)?;
     let mut model = Model::default();
     model.add_mesh("map", mesh);
     let truth = results.ground_truth_in_space.as_deref();

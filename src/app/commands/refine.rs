@@ -175,7 +175,7 @@ fn prepare(
     context: &Context,
     files: &RunFiles,
 ) -> Result<(Claims, PathBuf)> {
-    let mut names: Vec<&str> = [REPORT_FILES, REFINEMENT_FILES].concat();
+    let mut names: Vec<&str> = [&REPORT_FILES[..], &REFINEMENT_FILES].concat();
     names.push("ground_truth_poses.npy");
     names.extend(config.output.plots.then_some("plots"));
     let is_trajectory = config.is_trajectory();
@@ -423,6 +423,7 @@ fn write_run(
     run_output::write_results(files, results)?;
     let refined = Trajectory::refined(results, &sequence.frames);
     refined.write(files, "refined", sequence, config.all_poses)?;
+    refined.write_geojson(files, "refined", map, config.all_poses)?;
     output::write_yaml(&files.file("effective_refinement.yml"), config)?;
     let odometry = match (config.motion.odometry, &config.motion.odometry_file) {
         // It may be that of a topic.

@@ -21,6 +21,7 @@ use crate::evaluation::{
 };
 use crate::files::folder_of;
 use crate::geometry::{Pose2, Pose3, StampedPose};
+use crate::georeference::write_geojson;
 use crate::localization::{ParticleSet, State};
 use crate::map::Map;
 use crate::recording::poses::{write_kitti, write_tum};
@@ -83,17 +84,19 @@ impl RunFiles {
 pub const REPORT_FILES: [&str; 4] = ["report.json", "report.md", "report.html", "frames.csv"];
 
 /// Further files that localization writes next to its result.
-pub const LOCALIZATION_FILES: [&str; 4] = [
+pub const LOCALIZATION_FILES: [&str; 5] = [
     "mcl_tum.txt",
     "mcl_kitti.txt",
+    "mcl.geojson",
     "ground_truth_poses.npy",
     "effective_localization.yml",
 ];
 
 /// Files that refinement adds to a result.
-pub const REFINEMENT_FILES: [&str; 4] = [
+pub const REFINEMENT_FILES: [&str; 5] = [
     "refined_tum.txt",
     "refined_kitti.txt",
+    "refined.geojson",
     "refined_poses.npy",
     "effective_refinement.yml",
 ];
@@ -216,6 +219,31 @@ impl<'a> Trajectory<'a> {
         output::write_file(&kitti, |file| {
             write_kitti(file, self.poses, &world_from_map, &calibration)
         })
+    }
+}
+
+impl Trajectory<'_> {
+    /// Writes `<name>.geojson`, the poses that are trusted on the Earth, or all of them, where the place of the map is known.
+    pub fn write_geojson(&self, files: &RunFiles, name: &str, map: &Map, all: bool) -> Result<()> {
+        let path = files.file(&format!("{name}.geojson"));
+        let Some(georeference) = &map.path.georeference else {
+            return output::remove_if_exists(&path);
+        };
+        let rows: Vec<usize> = if all {
+            (0..self.poses.len()).collect()
+        } else {
+            self.trusted().collect()
+        };
+        let stretches: Vec<Vec<StampedPose>> = rows
+            .chunk_by(|a, b| a + 1 == *b)
+            .map(|rows| {
+                let poses = rows.iter();
+                poses
+                    .map(|&row| self.frames[row].stamped(self.poses[row]))
+                    .collect()
+            })
+            .collect();
+        output::write_file(&path, |file| write_geojson(file, georeference, &stretches))
     }
 }
 

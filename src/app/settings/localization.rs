@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{
-    MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig, RecordingConfig,
-    require_path,
+    GnssInputConfig, MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig,
+    RecordingConfig, require_path,
 };
 use crate::geometry::FARTHEST_M;
 use crate::localization::TrackerConfig;
@@ -44,6 +44,9 @@ pub struct LocalizationConfig {
     pub pose_tracking: Option<bool>,
     /// Start: x, y in the map [m], heading [deg].
     pub initial_pose: Option<[f64; 3]>,
+    /// Positions of a GNSS receiver, of which the first is a start in a map with a place on the Earth where `initial_pose` is
+    /// not given: around it in every heading.
+    pub gnss: GnssInputConfig,
     /// Initial distribution of the particles: around a known start (tracking), along the mapped road (corridor), or over the
     /// whole map (extent); `None`: it follows from `pose_tracking` and `initial_pose`.
     pub initialization: Option<Initialization>,
@@ -131,6 +134,7 @@ impl Validate for LocalizationConfig {
         nested("recording", &self.recording)?;
         nested("given_poses", &self.given_poses)?;
         nested("map_input", &self.map_input)?;
+        nested("gnss", &self.gnss)?;
         require_path("result_path", &self.result_path)?;
         self.motion.validate(&self.given_poses)?;
         self.validate_start()?;

@@ -27,6 +27,10 @@ pub struct ExportArgs {
     #[arg(long, value_name = "FOLDER", group = "format")]
     pub pcd: Option<PathBuf>,
 
+    /// Path on the Earth to write, that of a result or of the mapping drive, where the place of the map is known (.geojson).
+    #[arg(long, value_name = "FILE", group = "format")]
+    pub geojson: Option<PathBuf>,
+
     /// Spacing of the points of tiles: one point per square of the surface [m].
     #[arg(long, value_name = "M", requires = "pcd", value_parser = spacing, default_value_t = Self::SPACING_M)]
     pub spacing: f64,
@@ -77,6 +81,7 @@ impl ExportArgs {
             mcap: Some(log.to_owned()),
             glb: None,
             pcd: None,
+            geojson: None,
             spacing: Self::SPACING_M,
             tile_size: Self::TILE_SIZE_M,
             recording: None,

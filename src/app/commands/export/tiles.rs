@@ -3,6 +3,7 @@
 //! The metadata file is removed first and written last: without it, the map loader loads no tiles.
 
 use std::fs;
+use std::iter;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
@@ -69,7 +70,12 @@ pub fn write(
     output::create_subfolder(&tiles_folder)?;
     remove_tiles(&tiles_folder)?;
     write_tiles(&tiles, &tiles_folder, context)?;
-    let metadata = metadata(&tiles, args.tile_size, &[format!("frame: {frame}")]);
+    let georeference = path.and_then(|path| path.georeference.as_ref());
+    let georeference = georeference.map(serde_json::to_string).transpose()?;
+    let comments: Vec<String> = iter::once(format!("frame: {frame}"))
+        .chain(georeference.map(|json| format!("georeference: {json}")))
+        .collect();
+    let metadata = metadata(&tiles, args.tile_size, &comments);
     output::write_text(&metadata_file, &metadata)?;
     Ok(Some(TilesReport {
         tiles: tiles.len(),

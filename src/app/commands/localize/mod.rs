@@ -2,6 +2,7 @@
 
 mod filled;
 pub mod frame_tracker;
+mod gnss_start;
 pub mod opened;
 pub mod recorder;
 pub mod tracking;
@@ -66,6 +67,11 @@ pub struct LocalizeArgs {
     #[arg(long, value_name = "X,Y,HEADING", value_parser = start_pose, allow_hyphen_values = true)]
     #[serde(rename = "initial_pose")]
     pub start: Option<[f64; 3]>,
+
+    /// Positions of a GNSS receiver, a start in a map with a place on the Earth: sentences of NMEA, rows of time, latitude,
+    /// longitude and height, a folder oxts, or a topic of the bag; sets the key `gnss_file`.
+    #[arg(long = "gnss", value_name = "SOURCE")]
+    pub gnss_file: Option<PathBuf>,
 
     /// Odometry, true poses and result.
     #[command(flatten)]

@@ -8,6 +8,7 @@ use anyhow::Result;
 
 use super::super::motion_source::MotionSource;
 use super::super::stages::{RecordingInputs, input_files};
+use super::gnss_start;
 use crate::app::report::RunFiles;
 use crate::app::report::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES};
 use crate::app::run::{Claims, Context, Outputs, input};
@@ -51,11 +52,15 @@ pub fn open(
     let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
     let files = RunFiles::new(&config.result_path);
     context.interrupt.keeps("no frame was finished");
-    let read = input_files(inputs, &config.map_input, &config.motion, context)?;
+    let mut read = input_files(inputs, &config.map_input, &config.motion, context)?;
+    let fixes = config.gnss.file(&config.recording);
+    input::require(fixes.as_slice())?;
+    read.extend(fixes);
     let claims = prepare(config, read, further_files, &files)?;
     let map = config.map_input.load(config.map_options(), context)?;
     let mut resolved = config.clone();
     let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
+    gnss_start::resolve(&mut resolved, &map, &recording)?;
     let mut rng = stream(config.tracker.seed, ODOMETRY_STREAM);
     let (motion, odometry_file) =
         MotionSource::open(&config.motion, &inputs, &recording, &mut rng)?;

@@ -35,6 +35,7 @@ pub fn write_trajectories(opened: &Opened, run: &Run) -> Result<()> {
     let Opened {
         config,
         files,
+        map,
         recording,
         ..
     } = opened;
@@ -46,9 +47,11 @@ pub fn write_trajectories(opened: &Opened, run: &Run) -> Result<()> {
     let frames = run.frames(opened);
     let mcl = Trajectory::of_filter(results, &frames);
     mcl.write(files, "mcl", recording, config.all_poses)?;
+    mcl.write_geojson(files, "mcl", map, config.all_poses)?;
     if config.refine {
         let refined = Trajectory::refined(results, &frames);
         refined.write(files, "refined", recording, config.all_poses)?;
+        refined.write_geojson(files, "refined", map, config.all_poses)?;
     }
     output::write_yaml(&files.file("effective_localization.yml"), config)
 }
