@@ -177,6 +177,58 @@ impl Map {
         arrays::of_pose(py, &self.map.path.world_from_map)
     }
 
+    /// Place of the map on the Earth: latitude, longitude, height of its origin, rotation, zone of UTM and standard
+    /// deviations, with the names and units of its comment in the file; None where it is not known.
+    #[getter]
+    fn georeference<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
+        let Some(place) = &self.map.path.georeference else {
+            return Ok(None);
+        };
+        let dict = PyDict::new(py);
+        for (name, value) in [
+            ("latitude_deg", place.latitude_deg),
+            ("longitude_deg", place.longitude_deg),
+            ("height_m", place.height_m),
+            ("roll_deg", place.roll_deg),
+            ("pitch_deg", place.pitch_deg),
+            ("yaw_deg", place.yaw_deg),
+            ("horizontal_m", place.horizontal_m),
+            ("vertical_m", place.vertical_m),
+            ("heading_deg", place.heading_deg),
+        ] {
+            dict.set_item(name, value)?;
+        }
+        dict.set_item("epsg", place.utm.epsg())?;
+        Ok(Some(dict))
+    }
+
+    /// Latitude, longitude [deg] and height [m] of points of the map, (N, 3) both.
+    ///
+    /// Raises Error where the place of the map on the Earth is not known.
+    fn geodetic<'py>(
+        &self,
+        py: Python<'py>,
+        points: Numbers2<'py, f64>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let place = self.map.path.georeference.as_ref();
+        let place = place.ok_or_else(|| {
+            raised(anyhow::anyhow!(
+                "the place of the map on the Earth is not known; build it with fpmcl build-map --gnss"
+            ))
+        })?;
+        if points.shape()[1] != 3 {
+            return Err(PyValueError::new_err("points must have the shape (N, 3)"));
+        }
+        let earth = place.on_earth().map_err(raised)?;
+        let mut rows = Vec::with_capacity(points.shape()[0]);
+        for point in points.as_array().rows() {
+            let at = earth.geodetic(&[point[0], point[1], point[2]].into());
+            let at = at.map_err(raised)?;
+            rows.push([at.latitude_deg, at.longitude_deg, at.height_m]);
+        }
+        Ok(Array2::from(rows).into_pyarray(py))
+    }
+
     /// What renders the map.
     #[getter]
     fn renderer(&self) -> String {

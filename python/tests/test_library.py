@@ -211,6 +211,12 @@ def test_a_map_needs_no_poses(recording):
         fpmcl.Map.build([recording[0], recording[1]], np.eye(4))
 
 
+def test_a_map_without_gnss_has_no_place_on_the_earth(world):
+    assert world.georeference is None
+    with pytest.raises(fpmcl.Error, match="place of the map"):
+        world.geodetic(np.zeros((1, 3)))
+
+
 def test_a_second_drive_is_added_to_a_map(recording, world):
     extended = fpmcl.Map.build(recording, onto=world, depth=8)
     assert len(extended.vertices) > 0

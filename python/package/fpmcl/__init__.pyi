@@ -176,6 +176,18 @@ class Map:
         """Pose of the map in the world of the poses that it was built with, (4, 4)."""
 
     @property
+    def georeference(self) -> dict[str, float] | None:
+        """Place of the map on the Earth: ``latitude_deg``, ``longitude_deg``, ``height_m`` of its origin, ``roll_deg``,
+        ``pitch_deg``, ``yaw_deg`` of the rotation to east, north and up, ``epsg`` of its zone of UTM, and the standard
+        deviations ``horizontal_m``, ``vertical_m``, ``heading_deg``; None where it is not known."""
+
+    def geodetic(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Latitude, longitude [deg] and height [m] of points of the map, (N, 3) both.
+
+        Raises Error where the place of the map on the Earth is not known.
+        """
+
+    @property
     def renderer(self) -> str:
         """What renders the map: backend and device."""
 
