@@ -4,6 +4,7 @@ use anyhow::Context as _;
 use clap::{ArgAction, Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
 use tracing::level_filters::LevelFilter;
 
+use crate::app::commands::benchmark::{self, BenchmarkArgs};
 use crate::app::commands::build_map::{self, BuildMapArgs};
 use crate::app::commands::demo::{self, DemoArgs};
 use crate::app::commands::doctor::{self, DoctorArgs};
@@ -141,6 +142,14 @@ Examples:
   fpmcl compare --collect                     tables of the finished runs")]
     Compare(CompareArgs),
 
+    /// Measure odometry, a map and a localization on a public sequence, beside published figures.
+    #[command(after_help = "\
+Examples:
+  fpmcl benchmark kitti sequences/07/         every other scan in a map of the others
+  fpmcl benchmark helipr Roundabout01/ --second Roundabout03/ --topic Ouster
+  fpmcl benchmark auto drive_1/ --second drive_2/ --output results/streets")]
+    Benchmark(BenchmarkArgs),
+
     /// Simulate a drive through a procedural street with ground truth.
     #[command(after_help = "\
 Examples:
@@ -263,6 +272,7 @@ impl Command {
             | Self::Evaluate(EvaluateArgs { run, .. })
             | Self::Simulate(run) => run.source.machine,
             Self::Compare(args) => args.source.machine,
+            Self::Benchmark(args) => args.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
             Self::Export(args) => args.machine(),
@@ -344,6 +354,7 @@ impl Command {
                 simulate::run(&config, existing, &context)
             }
             Self::Compare(args) => compare::run(args, form, context),
+            Self::Benchmark(args) => benchmark::run(args, context),
             Self::Demo(args) => demo::run(args, context),
             Self::Ground(args) => ground::run(args, context),
             Self::Config(args) => args.run(),

@@ -3,6 +3,7 @@
 use schemars::generate::SchemaSettings;
 use schemars::{JsonSchema, Schema};
 
+use super::commands::benchmark::BenchmarkReport;
 use super::commands::demo::DemoReport;
 use super::commands::doctor::MachineReport;
 use super::commands::export::ExportReport;
@@ -27,6 +28,7 @@ pub fn schemas() -> Vec<(&'static str, Schema)> {
         ("localize, live, refine, evaluate", schema::<Report>()),
         ("export", schema::<ExportReport>()),
         ("compare", schema::<ComparisonFile>()),
+        ("benchmark", schema::<BenchmarkReport>()),
         ("simulate", schema::<SimulationReport>()),
         ("demo", schema::<DemoReport>()),
         ("ground", schema::<GroundReport>()),

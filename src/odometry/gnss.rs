@@ -133,3 +133,7 @@ fn fix_edges(maps: &[Submap], centers: &[Pose3], targets: &[FixTarget]) -> Vec<E
     };
     sums.iter().enumerate().filter_map(edge).collect()
 }
+
+#[cfg(test)]
+#[path = "gnss_tests.rs"]
+mod tests;

@@ -1,6 +1,7 @@
 //! The commands: files, progress and pictures around the library.
 
 // The commands, in the order of their use.
+pub mod benchmark;
 pub mod build_map;
 pub mod demo;
 pub mod doctor;

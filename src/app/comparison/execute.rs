@@ -17,7 +17,9 @@ use crate::app::report::run_output::{self, REFINEMENT_FILES};
 use crate::app::report::run_page::RunPage;
 use crate::app::report::{LocalizationResults, Report, RunFiles, TrajectoryReport};
 use crate::app::run::artefact::{self, FINISHED_FILE, SharedResult};
-use crate::app::run::{CLAIMS_FILE, Claims, Context, Interrupted, Lock, Outputs, output, version};
+use crate::app::run::{
+    CLAIMS_FILE, Claims, Context, Interrupted, Lock, Outputs, machine, output, version,
+};
 use crate::app::settings::{BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::evaluation::trust::{Trust, TrustedRun};
 use crate::evaluation::{EvaluatedTrajectory, RangeMclRules};
@@ -230,17 +232,13 @@ impl<'a> Executor<'a> {
 
     /// Description of the machine for the record of a run.
     fn machine(&self, report: Option<&Report>) -> BTreeMap<String, String> {
-        let unknown = || "unknown".to_owned();
         let renderer = report.and_then(|report| report.about.get("renderer").cloned());
-        let (system, architecture) = (std::env::consts::OS, std::env::consts::ARCH);
-        [
-            ("processor", processor().unwrap_or_else(unknown)),
-            ("threads", self.context.threads.to_string()),
-            ("system", format!("{system} {architecture}")),
-            ("renderer", renderer.unwrap_or_else(unknown)),
-        ]
-        .map(|(key, value)| (key.to_owned(), value))
-        .into()
+        let mut properties = machine::properties(self.context.threads);
+        properties.insert(
+            "renderer".to_owned(),
+            renderer.unwrap_or_else(|| "unknown".to_owned()),
+        );
+        properties
     }
 }
 
@@ -322,13 +320,6 @@ fn trust(result: &Path) -> Result<Option<Trust>> {
     let places = results.places.as_deref().unwrap_or_default();
     trust.places = median(places.iter().take(searching).copied());
     Ok(Some(trust))
-}
-
-/// Name of the processor, on systems with `/proc/cpuinfo`.
-fn processor() -> Option<String> {
-    let text = fs::read_to_string("/proc/cpuinfo").ok()?;
-    let name = text.lines().find(|line| line.starts_with("model name"))?;
-    Some(name.split_once(':')?.1.trim().to_owned())
 }
 
 /// Prepares the record of a run in its folder, and further files there.

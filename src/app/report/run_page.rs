@@ -163,7 +163,7 @@ impl RunPage<'_> {
 }
 
 /// The main metrics of both trajectories, and all of them.
-fn numbers(report: &Report) -> Vec<PageElement> {
+pub fn numbers(report: &Report) -> Vec<PageElement> {
     let mut main = metrics(report, |row| report.is_main(row));
     main.name = "numbers".to_owned();
     let all = Table {
@@ -233,7 +233,7 @@ fn evaluated(mcl: Option<&TrajectoryMetrics>, refined: Option<&TrajectoryMetrics
 }
 
 /// What each number is.
-fn definitions(report: &Report) -> PageElement {
+pub fn definitions(report: &Report) -> PageElement {
     let term = |row: &MetricRow| match row.unit {
         "" => row.name.to_owned(),
         unit => format!("{} [{unit}]", row.name),
@@ -246,7 +246,7 @@ fn definitions(report: &Report) -> PageElement {
 }
 
 /// Relative errors of a trajectory by the length of the segments; `None` if it is shorter than all.
-fn segments(name: &str, metrics: &SpatialMetrics) -> Option<Table> {
+pub fn segments(name: &str, metrics: &SpatialMetrics) -> Option<Table> {
     let row = |it: &LengthErrors| {
         vec![
             it.length_m.into(),
@@ -286,7 +286,7 @@ fn stages(seconds: &BTreeMap<String, f64>) -> Table {
     }
 }
 
-fn facts(map: &BTreeMap<String, String>) -> Vec<(String, String)> {
+pub fn facts(map: &BTreeMap<String, String>) -> Vec<(String, String)> {
     map.clone().into_iter().collect()
 }
 

@@ -7,6 +7,7 @@ pub mod failure;
 pub mod input;
 pub mod interrupt;
 pub mod logging;
+pub mod machine;
 pub mod memory;
 pub mod output;
 pub mod progress;

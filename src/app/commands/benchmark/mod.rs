@@ -1,0 +1,463 @@
+//! `benchmark`: odometry, map and localization of a public sequence, beside published figures.
+//!
+//! ```text
+//! odometry      the first session by its scans alone, compared with its truth by KITTI's rules
+//! map           of the first session, at its true poses where there are any; without a second session, of every other scan
+//! localization  of the second session, or of the other scans, and refined
+//! ```
+//!
+//! Each stage has a folder `stages/KEY`, whose key is a hash of its configuration and of the program: what is finished is
+//! used again.
+
+mod page;
+mod published;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, Result};
+use clap::Args;
+use schemars::JsonSchema;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::stages::RecordingInputs;
+use super::{build_map, evaluate, localize, odometry, refine};
+use crate::app::report::results::length;
+use crate::app::report::{Report, RunFiles};
+use crate::app::run::arguments::yaml;
+use crate::app::run::artefact::hash::hash_of_texts;
+use crate::app::run::artefact::{self, SharedResult};
+use crate::app::run::{Context, Form, MachineArgs, Outputs, Printed, machine, output, version};
+use crate::app::settings::{
+    self, BuildMapConfig, EvaluationConfig, LocalizationConfig, OdometryCommandConfig,
+    PoseInputConfig, RecordingConfig,
+};
+use crate::configuration::Configuration;
+use crate::recording::Layout;
+
+/// Arguments of `benchmark`.
+#[derive(Clone, Debug, Args)]
+pub struct BenchmarkArgs {
+    /// Layout of the data set, such as kitti, mulran or helipr; auto: as its files show.
+    #[arg(value_name = "LAYOUT", value_parser = layout)]
+    pub layout: LayoutArg,
+
+    /// The sequence.
+    #[arg(value_name = "FOLDER")]
+    pub recording: PathBuf,
+
+    /// Another session of the place, which is localized in the map of the first; by default every other scan of the first.
+    #[arg(long, value_name = "FOLDER")]
+    pub second: Option<PathBuf>,
+
+    /// Lidar or scene, where the folder has several, or topic of a bag.
+    #[arg(long, value_name = "NAME")]
+    pub topic: Option<String>,
+
+    /// The same of the second session; by default that of the first.
+    #[arg(long, value_name = "NAME")]
+    pub second_topic: Option<String>,
+
+    /// True poses of the sequence; by default those of its layout.
+    #[arg(long, value_name = "FILE")]
+    pub truth: Option<PathBuf>,
+
+    /// True poses of the second session; by default those of its layout.
+    #[arg(long, value_name = "FILE")]
+    pub second_truth: Option<PathBuf>,
+
+    /// Calibration of the camera, if true poses that are given are those of a camera.
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calibration: Option<PathBuf>,
+
+    /// Output folder.
+    #[arg(long, value_name = "FOLDER", default_value = "results/benchmark")]
+    pub output: PathBuf,
+
+    /// Value of a key of any stage that has it; repeatable.
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = crate::app::run::arguments::setting)]
+    pub settings: Vec<(String, String)>,
+
+    /// Seed of all random choices.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+
+    /// Renderer and threads.
+    #[command(flatten)]
+    pub machine: MachineArgs,
+}
+
+/// A layout that was named; `None`: as the files show.
+#[derive(Clone, Copy, Debug)]
+pub struct LayoutArg(pub Option<Layout>);
+
+fn layout(name: &str) -> Result<LayoutArg, String> {
+    match name {
+        "auto" => Ok(LayoutArg(None)),
+        name => {
+            let layout = name.parse().map_err(|error| format!("{error}, `auto`"))?;
+            Ok(LayoutArg(Some(layout)))
+        }
+    }
+}
+
+/// The file to send back: all figures, what they were measured with, and on what.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct BenchmarkReport {
+    /// Layout of the recordings.
+    pub layout: String,
+    /// The sequence.
+    pub recording: PathBuf,
+    /// The session that was localized; `null`: every other scan of the sequence.
+    pub second: Option<PathBuf>,
+    /// Name, version and hash of the program.
+    pub program: String,
+    /// The machine.
+    pub machine: BTreeMap<String, String>,
+    /// Wall time of each stage [s].
+    pub stage_seconds: BTreeMap<String, f64>,
+    /// The odometry.
+    pub odometry: OdometryFigures,
+    /// The map.
+    pub map: MapFigures,
+    /// The localization.
+    pub localization: Report,
+}
+
+/// Figures of the odometry.
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
+pub struct OdometryFigures {
+    /// Number of scans.
+    pub scans: usize,
+    /// Scans whose pose was predicted, because they did not fit.
+    pub predicted: usize,
+    /// Length of the path [m].
+    pub path_m: f64,
+    /// Median and 95 % quantile of the time per scan [s].
+    pub seconds_per_scan: Option<[f64; 2]>,
+    /// Errors of the odometry, scan by scan, without loops and adjustment; `null` without a truth.
+    pub scan_by_scan: Option<Box<Report>>,
+    /// Errors after loops were closed and all poses adjusted.
+    pub adjusted: Option<Box<Report>>,
+}
+
+/// Figures of the map.
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
+pub struct MapFigures {
+    /// Key scans that the map was built from.
+    pub mapped_frames: usize,
+    /// Length of their path [m].
+    pub path_m: f64,
+    /// Number of triangles.
+    pub triangles: usize,
+    /// Size of the file [MB].
+    pub map_mb: f64,
+    /// Wall time of the build [s].
+    pub seconds: f64,
+}
+
+/// A session: its recording, and the file of its true poses.
+struct Session {
+    recording: RecordingConfig,
+    truth: Option<PathBuf>,
+    calibration: Option<PathBuf>,
+}
+
+/// Runs the stages that are not finished, and writes the page and the file of figures.
+pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
+    let main = args.output.join("benchmark.json");
+    let mut claims = Outputs {
+        key: "output",
+        main: &main,
+        magic: None,
+        names: ["benchmark.html", "stages"].map(str::to_owned).into(),
+        inputs: vec![("recording", &args.recording)],
+        force: true,
+    }
+    .prepare()?;
+    let first = Session::open(args, &args.recording, &args.topic, &args.truth)?;
+    let second = match &args.second {
+        Some(folder) => {
+            let topic = args.second_topic.clone().or(args.topic.clone());
+            Some(Session::open(args, folder, &topic, &args.second_truth)?)
+        }
+        None => None,
+    };
+    let benchmark = Benchmark { args, context };
+    let mut stage_seconds = BTreeMap::new();
+    let mut time = |name: &str, stage: &SharedResult| {
+        stage_seconds.insert(name.to_owned(), stage.seconds);
+    };
+    let odometry = benchmark.odometry(&first)?;
+    time("1 odometry", &odometry);
+    let map = benchmark.map(&first, second.is_some())?;
+    time("2 map", &map);
+    let located = second.as_ref().unwrap_or(&first);
+    let localization = benchmark.localization(located, second.is_some(), &map.folder)?;
+    time("3 localization", &localization);
+    let report = BenchmarkReport {
+        layout: match args.layout.0 {
+            Some(layout) => layout.name().to_owned(),
+            None => "as the files show".to_owned(),
+        },
+        recording: args.recording.clone(),
+        second: args.second.clone(),
+        program: version::program()?,
+        machine: machine::properties(context.threads),
+        stage_seconds,
+        odometry: read_json(&odometry.folder.join(FIGURES))?,
+        map: read_json(&map.folder.join(MAP_REPORT))?,
+        localization: Report::read_json(&localization.folder.join("report.json"))?,
+    };
+    claims.begin(&main)?;
+    let files = RunFiles::new(&localization.folder.join(RESULT));
+    let page = page::page(&report, &map.folder, &files)?;
+    output::write_text(&args.output.join("benchmark.html"), &page.to_html())?;
+    output::write_json(&main, &report)?;
+    claims.finish(&main)?;
+    let rows = report.rows();
+    let shown = args.output.join("benchmark.html").display().to_string();
+    let rows = rows.into_iter().chain([("page", shown)]);
+    let printed = Printed::rows(&rows.collect::<Vec<_>>(), &report)?;
+    Ok(printed.of_run(report.localization.localized))
+}
+
+const FIGURES: &str = "figures.json";
+const MAP: &str = "map.ply";
+const MAP_REPORT: &str = "map.report.json";
+const RESULT: &str = "localization.npz";
+
+/// The stages.
+struct Benchmark<'a> {
+    args: &'a BenchmarkArgs,
+    context: &'a Context,
+}
+
+impl Benchmark<'_> {
+    /// Finds the poses of a session by its scans, and their errors.
+    fn odometry(&self, session: &Session) -> Result<SharedResult> {
+        let config: OdometryCommandConfig = self.configured(session.keys(None, false))?;
+        self.stage("odometry", &config, |folder| {
+            let config = OdometryCommandConfig {
+                output_folder: folder.to_owned(),
+                ..config.clone()
+            };
+            let printed = odometry::run(&config, self.context).context("while finding poses")?;
+            let found: Value = serde_json::from_str(&printed.in_form(Form::Json))?;
+            let errors = |name: &str| -> Result<Option<Box<Report>>> {
+                if session.truth.is_none() {
+                    return Ok(None);
+                }
+                let evaluated = folder.join(format!("{name}_evaluation"));
+                let keys = [
+                    ("result_file", path(&folder.join(format!("{name}_tum.txt")))),
+                    ("output_folder", path(&evaluated)),
+                ];
+                let keys = keys.into_iter().chain(session.evaluation_keys());
+                let config: EvaluationConfig = self.configured(keys.collect())?;
+                let report = evaluate::run(&config, self.context);
+                let report = report.with_context(|| format!("while evaluating {name}"))?;
+                Ok(Some(Box::new(report)))
+            };
+            let figures = OdometryFigures {
+                scan_by_scan: errors("odometry")?,
+                adjusted: errors("poses")?,
+                ..serde_json::from_value(with_nulls(found, ["scan_by_scan", "adjusted"]))?
+            };
+            output::write_json(&folder.join(FIGURES), &figures)
+        })
+    }
+
+    /// Builds the map of a session, or of every other scan of it.
+    fn map(&self, session: &Session, is_whole: bool) -> Result<SharedResult> {
+        let mut keys = session.keys(Some(0), is_whole);
+        keys.extend(session.truth_keys());
+        let config: BuildMapConfig = self.configured(keys)?;
+        self.stage("map", &config, |folder| {
+            let config = BuildMapConfig {
+                mesh_file: folder.join(MAP),
+                ..config.clone()
+            };
+            let built = build_map::run(&config, self.context);
+            built.context("while building the map").map(drop)
+        })
+    }
+
+    /// Localizes a session, or every other scan of it, in a map, and refines it.
+    fn localization(&self, session: &Session, is_whole: bool, map: &Path) -> Result<SharedResult> {
+        let mut keys = session.keys(Some(1), is_whole);
+        keys.extend(session.truth_keys());
+        keys.push(("map_input.map_file", path(&map.join(MAP))));
+        let config: LocalizationConfig = self.configured(keys)?;
+        self.stage("localization", &config, |folder| {
+            let config = LocalizationConfig {
+                result_path: folder.join(RESULT),
+                ..config.clone()
+            };
+            localize::run(&config, self.context).context("while localizing")?;
+            let refinement = refine::base_config(Some(&config.result_path));
+            let refined = refine::run(&refinement, self.context);
+            refined.context("while refining").map(drop)
+        })
+    }
+
+    /// Makes what a stage leaves in its folder, unless it is there.
+    fn stage(
+        &self,
+        name: &str,
+        config: &impl Serialize,
+        make: impl FnOnce(&Path) -> Result<()>,
+    ) -> Result<SharedResult> {
+        let text = serde_json::to_string(config)?;
+        let key = hash_of_texts(&[name, &text, version::executable_hash()?]);
+        let folder = self.args.output.join("stages");
+        artefact::get_or_create(&folder, &format!("{name}-{}", &key[..16]), make)
+    }
+
+    /// A configuration with keys, and with those settings of the command line that it has.
+    fn configured<T: Configuration>(&self, keys: Vec<(&str, Value)>) -> Result<T> {
+        let mut given: Vec<(String, String)> = keys
+            .into_iter()
+            .map(|(key, value)| (key.to_owned(), yaml(&value)))
+            .collect();
+        given.push(("output.force".to_owned(), "true".to_owned()));
+        if let Some(seed) = self.args.seed
+            && settings::has_key::<T>("seed")?
+        {
+            given.push(("seed".to_owned(), seed.to_string()));
+        }
+        for (key, value) in &self.args.settings {
+            if settings::has_key::<T>(key)? {
+                given.push((key.clone(), value.clone()));
+            }
+        }
+        Ok(settings::with_settings(T::default(), &given)?)
+    }
+}
+
+impl Session {
+    fn open(
+        args: &BenchmarkArgs,
+        folder: &Path,
+        topic: &Option<String>,
+        truth: &Option<PathBuf>,
+    ) -> Result<Self> {
+        let recording = RecordingConfig {
+            scan_folder: folder.to_owned(),
+            layout: args.layout.0,
+            topic: topic.clone(),
+            ..RecordingConfig::default()
+        };
+        let no_poses = PoseInputConfig::default();
+        let opened = RecordingInputs::new(&recording, &no_poses).open()?;
+        let (truth, calibration) = match truth {
+            Some(truth) => (Some(truth.clone()), args.calibration.clone()),
+            None => (opened.files.poses.clone(), opened.files.calibration.clone()),
+        };
+        if truth.is_none() {
+            tracing::warn!(
+                "{} has no true poses, so that there are no errors of it; give --truth",
+                folder.display()
+            );
+        }
+        Ok(Self {
+            recording,
+            truth,
+            calibration,
+        })
+    }
+
+    /// Keys of the recording: of all scans, or of every other one from `start` on.
+    fn keys(&self, start: Option<usize>, is_whole: bool) -> Vec<(&'static str, Value)> {
+        let mut keys = vec![("recording.scan_folder", path(&self.recording.scan_folder))];
+        let layout = self.recording.layout.map(|layout| json!(layout));
+        keys.extend(layout.map(|layout| ("recording.layout", layout)));
+        let topic = self.recording.topic.as_ref();
+        keys.extend(topic.map(|topic| ("recording.topic", json!(topic))));
+        if let (Some(start), false) = (start, is_whole) {
+            keys.push(("recording.frames.start_idx", json!(start)));
+            keys.push(("recording.frames.frame_step", json!(2)));
+        }
+        keys
+    }
+
+    /// Keys of the true poses.
+    fn truth_keys(&self) -> Vec<(&'static str, Value)> {
+        let keys = [
+            ("given_poses.pose_file", &self.truth),
+            ("given_poses.calib_file", &self.calibration),
+        ];
+        let known = keys
+            .into_iter()
+            .filter_map(|(key, file)| Some((key, path(file.as_ref()?))));
+        known.collect()
+    }
+
+    /// Keys of an evaluation against the true poses.
+    fn evaluation_keys(&self) -> Vec<(&'static str, Value)> {
+        let mut keys = self.truth_keys();
+        let of_recording = self.keys(None, true).into_iter().map(|(key, value)| {
+            let name = key.rsplit('.').next().unwrap_or(key);
+            (name, value)
+        });
+        keys.extend(of_recording);
+        keys
+    }
+}
+
+impl BenchmarkReport {
+    /// Names and values, most important first.
+    fn rows(&self) -> Vec<(&'static str, String)> {
+        let mut rows = Vec::new();
+        let of_odometry = [
+            ("odometry", &self.odometry.scan_by_scan),
+            ("odometry, adjusted", &self.odometry.adjusted),
+        ];
+        for (name, report) in of_odometry {
+            let metrics = report
+                .as_ref()
+                .and_then(|report| report.trajectory.as_ref());
+            let segments = metrics.and_then(|it| it.kitti_segments);
+            rows.extend(segments.map(|it| {
+                let (percent, turn) = (it.translation_percent, it.rotation_deg_per_100_m());
+                (name, format!("{percent:.2} %, {turn:.2} deg/100 m"))
+            }));
+        }
+        for (name, report) in [
+            ("localization", &self.localization.mcl),
+            ("refined", &self.localization.refined),
+        ] {
+            rows.extend(report.as_ref().map(|report| {
+                let position = length(report.metrics.position_m.rmse);
+                let heading_deg = report.metrics.heading_rad.rmse.to_degrees();
+                (name, format!("{position}, {heading_deg:.3} deg"))
+            }));
+        }
+        rows.extend([
+            ("map", format!("{:.1} MB", self.map.map_mb)),
+            ("path", format!("{:.0} m", self.map.path_m)),
+        ]);
+        rows
+    }
+}
+
+fn read_json<T: DeserializeOwned>(path: &Path) -> Result<T> {
+    let text =
+        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    serde_json::from_str(&text)
+        .with_context(|| format!("{} is damaged; remove its folder", path.display()))
+}
+
+/// A value with further fields that are unknown.
+fn with_nulls<const N: usize>(mut value: Value, names: [&str; N]) -> Value {
+    for name in names {
+        value[name] = Value::Null;
+    }
+    value
+}
+
+fn path(path: &Path) -> Value {
+    json!(path.to_string_lossy())
+}

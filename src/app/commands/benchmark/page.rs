@@ -1,0 +1,101 @@
+//! The page of a benchmark.
+
+use std::path::Path;
+
+use anyhow::Result;
+
+use super::published::PUBLISHED;
+use super::{BenchmarkReport, MAP};
+use crate::app::report::pages::{Column, Page, PageElement, Section, Table};
+use crate::app::report::run_page::{PICTURES, definitions, facts, numbers, picture, segments};
+use crate::app::report::{Report, RunFiles};
+
+/// Assembles the page from the figures and the pictures of the stages.
+pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Result<Page> {
+    let odometry = &report.odometry;
+    let mut of_odometry = vec![PageElement::Facts(vec![
+        ("scans".to_owned(), odometry.scans.to_string()),
+        (
+            "of them predicted".to_owned(),
+            odometry.predicted.to_string(),
+        ),
+        ("path".to_owned(), format!("{:.1} m", odometry.path_m)),
+    ])];
+    for (name, errors) in [
+        ("odometry, scan by scan", &odometry.scan_by_scan),
+        ("after loops and adjustment", &odometry.adjusted),
+    ] {
+        let Some(errors) = errors else { continue };
+        of_odometry.push(PageElement::Paragraph(format!("Errors: {name}.")));
+        of_odometry.extend(numbers(errors));
+        let metrics = errors.trajectory.as_ref();
+        let table = metrics.and_then(|metrics| segments(name, metrics));
+        of_odometry.extend(table.map(PageElement::Table));
+    }
+    let figures = &report.map;
+    let mut of_map = vec![PageElement::Facts(vec![
+        ("scans".to_owned(), figures.mapped_frames.to_string()),
+        ("path".to_owned(), format!("{:.1} m", figures.path_m)),
+        ("triangles".to_owned(), figures.triangles.to_string()),
+        ("size".to_owned(), format!("{:.1} MB", figures.map_mb)),
+        ("time".to_owned(), format!("{:.1} s", figures.seconds)),
+    ])];
+    let image = map.join(MAP).with_extension("png");
+    of_map.extend(picture(&image, "The map from above")?);
+    let mut of_localization = numbers(&report.localization);
+    let plots = localized.file("plots");
+    for (_, name, caption) in [("", "path.png", "Path"), PICTURES[0], PICTURES[2]] {
+        of_localization.extend(picture(&plots.join(name), caption)?);
+    }
+    let seconds = report.stage_seconds.iter();
+    let mut settings = vec![("program".to_owned(), report.program.clone())];
+    settings.extend(facts(&report.machine));
+    settings.extend(
+        seconds.map(|(name, time_s)| (format!("time of {name}"), format!("{time_s:.0} s"))),
+    );
+    let reports = [odometry.scan_by_scan.as_deref(), Some(&report.localization)];
+    let defined = reports.into_iter().flatten().map(definitions);
+    let section = |title: &str, elements| Section {
+        title: title.to_owned(),
+        elements,
+    };
+    Ok(Page {
+        title: format!("Benchmark on {}", report.recording.display()),
+        verdict: verdict(&report.localization),
+        subtitle: match &report.second {
+            Some(second) => format!("{} localized in its map.", second.display()),
+            None => "Every other scan localized in the map of the others.".to_owned(),
+        },
+        sections: vec![
+            section("Odometry", of_odometry),
+            section("Map", of_map),
+            section("Localization", of_localization),
+            section("Published figures", vec![PageElement::Table(published())]),
+            section("Definitions", defined.collect()),
+            section("Program and machine", vec![PageElement::Facts(settings)]),
+        ],
+    })
+}
+
+fn verdict(localization: &Report) -> String {
+    localization.verdict()
+}
+
+/// Figures of peers, as they were published.
+fn published() -> Table {
+    Table {
+        name: "published".to_owned(),
+        title: "What others have published".to_owned(),
+        note: "Not measured here, and by the definitions of their authors.".to_owned(),
+        columns: ["method", "data", "figure", "quantity", "source"]
+            .map(Column::from)
+            .into(),
+        rows: (PUBLISHED.iter())
+            .map(|it| {
+                [it.method, it.data, it.figure, it.quantity, it.source]
+                    .map(Into::into)
+                    .into()
+            })
+            .collect(),
+    }
+}

@@ -1,0 +1,43 @@
+//! Figures that others have published about public sequences.
+
+/// A published figure.
+pub struct Published {
+    pub method: &'static str,
+    pub data: &'static str,
+    pub figure: &'static str,
+    /// What it is of.
+    pub quantity: &'static str,
+    pub source: &'static str,
+}
+
+/// Figures of peers. Ours have other definitions where the texts below differ: these are for orientation.
+pub const PUBLISHED: [Published; 4] = [
+    Published {
+        method: "GroundLoc",
+        data: "SemanticKITTI 00",
+        figure: "0.134 m",
+        quantity: "localization in a map, average trajectory error",
+        source: "Steinke and Göhring, GroundLoc (2025)",
+    },
+    Published {
+        method: "GroundLoc",
+        data: "HeLiPR Roundabout03, across sessions",
+        figure: "0.419 m",
+        quantity: "localization in the map of another session, average trajectory error",
+        source: "Steinke and Göhring, GroundLoc (2025)",
+    },
+    Published {
+        method: "range-mcl",
+        data: "KITTI 07",
+        figure: "0.38 m",
+        quantity: "localization in a mesh map, RMSE of the position, by its own evaluation script",
+        source: "Chen et al., Range Image-based LiDAR Localization (ICRA 2021)",
+    },
+    Published {
+        method: "KISS-ICP",
+        data: "KITTI 11 to 21",
+        figure: "0.61 %",
+        quantity: "odometry, translation over segments of 100 to 800 m",
+        source: "Vizzo et al., KISS-ICP (RA-L 2023), and KITTI's table of results",
+    },
+];

@@ -1,0 +1,26 @@
+//! Properties of the machine, for records of what was measured.
+
+use std::collections::BTreeMap;
+use std::fs;
+
+/// Processor, threads and system, by name.
+pub fn properties(threads: usize) -> BTreeMap<String, String> {
+    let (system, architecture) = (std::env::consts::OS, std::env::consts::ARCH);
+    [
+        (
+            "processor",
+            processor().unwrap_or_else(|| "unknown".to_owned()),
+        ),
+        ("threads", threads.to_string()),
+        ("system", format!("{system} {architecture}")),
+    ]
+    .map(|(key, value)| (key.to_owned(), value))
+    .into()
+}
+
+/// Name of the processor, on systems with `/proc/cpuinfo`.
+fn processor() -> Option<String> {
+    let text = fs::read_to_string("/proc/cpuinfo").ok()?;
+    let name = text.lines().find(|line| line.starts_with("model name"))?;
+    Some(name.split_once(':')?.1.trim().to_owned())
+}

@@ -1,0 +1,101 @@
+//! `benchmark`: odometry, map and localization of two sessions in one command, which resumes.
+
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use common::{Fpmcl, fpmcl, json, simulate_two_drives};
+
+const STREET: &str = "\
+output_folder: street
+seed: 5
+n_scans: 30
+scanner: {beams: 32, azimuth_steps: 720}
+";
+
+fn benchmark(folder: &Path) -> Fpmcl {
+    let call = fpmcl("benchmark").in_folder(folder);
+    let call = call.with("kitti").with("street/drive_1");
+    call.with("--second").with("street/drive_2").with("--quiet")
+}
+
+#[test]
+fn two_sessions_give_all_figures_and_a_second_run_takes_what_is_finished() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, STREET);
+    let printed = benchmark(folder).succeeds().stdout;
+    assert!(printed.contains("benchmark.html"), "{printed}");
+    let path = folder.join("results/benchmark/benchmark.json");
+    let report = json(&path);
+    let number = |pointer: &str| {
+        let found = report.pointer(pointer).and_then(serde_json::Value::as_f64);
+        found.unwrap_or_else(|| panic!("{pointer} is missing"))
+    };
+    assert_eq!(number("/odometry/scans"), 30.0);
+    assert!(number("/odometry/scan_by_scan/trajectory/position_m/rmse") < 0.3);
+    assert!(number("/odometry/adjusted/trajectory/position_m/rmse") < 0.3);
+    assert!(number("/map/triangles") > 1000.0);
+    for trajectory in ["mcl", "refined"] {
+        let rmse = format!("/localization/{trajectory}/metrics/position_m/rmse");
+        assert!(number(&rmse) < 0.1);
+    }
+    assert_eq!(report["layout"], "KITTI odometry");
+    assert!(report["machine"]["processor"].is_string());
+    let page = fs::read_to_string(folder.join("results/benchmark/benchmark.html")).unwrap();
+    for part in [
+        "Odometry",
+        "Localization",
+        "Published figures",
+        "GroundLoc",
+        "0.134 m",
+    ] {
+        assert!(page.contains(part), "{part}");
+    }
+    // The first session is complete: the second run measures nothing again.
+    fs::remove_file(folder.join("results/benchmark/benchmark.html")).unwrap();
+    benchmark(folder).succeeds();
+    assert_eq!(json(&path)["stage_seconds"], report["stage_seconds"]);
+    assert!(folder.join("results/benchmark/benchmark.html").exists());
+    // Another setting of one stage leaves the others.
+    benchmark(folder).set("num_particles", "500").succeeds();
+    let changed = json(&path);
+    let seconds = |report: &serde_json::Value, stage: &str| report["stage_seconds"][stage].clone();
+    assert_eq!(seconds(&changed, "2 map"), seconds(&report, "2 map"));
+    assert_ne!(
+        seconds(&changed, "3 localization"),
+        seconds(&report, "3 localization")
+    );
+}
+
+#[test]
+fn one_session_without_a_truth_is_divided_and_says_that_it_has_no_errors() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, STREET);
+    let drive = folder.join("street/drive_1");
+    for name in ["poses.txt", "calib.txt"] {
+        fs::remove_file(drive.join(name)).unwrap();
+    }
+    let call = fpmcl("benchmark").in_folder(folder).with("auto");
+    let output = call.with("street/drive_1").succeeds();
+    assert!(
+        output.stderr.contains("has no true poses"),
+        "{}",
+        output.stderr
+    );
+    let report = json(&folder.join("results/benchmark/benchmark.json"));
+    assert!(report["odometry"]["scan_by_scan"].is_null());
+    assert!(report["localization"]["mcl"].is_null());
+    assert_eq!(report["localization"]["localized"], true);
+    assert!(report["second"].is_null());
+}
+
+#[test]
+fn a_layout_that_nobody_knows_is_refused_with_those_that_are_read() {
+    let call = fpmcl("benchmark").with("kiti").with("drive");
+    call.rejects_usage_with(&["kiti", "kitti", "mulran", "auto"]);
+}
