@@ -140,7 +140,11 @@ mod tests {
         assert_relative_eq!(first.longitude_deg, 11.516_666_667, epsilon = 1e-9);
         assert_relative_eq!(first.height_m, 592.3, epsilon = 1e-3);
         assert_eq!(found.height_above, HeightReference::Ellipsoid);
-        assert_relative_eq!(found.fixes[0].horizontal_m.unwrap(), 0.7071, epsilon = 1e-3);
+        assert_relative_eq!(
+            found.fixes[0].horizontal_m.unwrap(),
+            0.5_f64.sqrt(),
+            epsilon = 1e-3
+        );
         assert_eq!(found.fixes[0].vertical_m, Some(2.5));
     }
 }

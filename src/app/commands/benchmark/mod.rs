@@ -9,6 +9,7 @@
 //! Each stage has a folder `stages/KEY`, whose key is a hash of its configuration and of the program: what is finished is
 //! used again.
 
+mod figures;
 mod page;
 mod published;
 
@@ -17,14 +18,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
 use clap::Args;
-use schemars::JsonSchema;
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+pub use self::figures::BenchmarkReport;
+use self::figures::OdometryFigures;
 use super::stages::RecordingInputs;
 use super::{build_map, evaluate, localize, odometry, refine};
-use crate::app::report::results::length;
 use crate::app::report::{Report, RunFiles};
 use crate::app::run::arguments::yaml;
 use crate::app::run::artefact::hash::hash_of_texts;
@@ -103,64 +104,10 @@ fn layout(name: &str) -> Result<LayoutArg, String> {
     }
 }
 
-/// The file to send back: all figures, what they were measured with, and on what.
-#[derive(Debug, Serialize, JsonSchema)]
-pub struct BenchmarkReport {
-    /// Layout of the recordings.
-    pub layout: String,
-    /// The sequence.
-    pub recording: PathBuf,
-    /// The session that was localized; `null`: every other scan of the sequence.
-    pub second: Option<PathBuf>,
-    /// Name, version and hash of the program.
-    pub program: String,
-    /// The machine.
-    pub machine: BTreeMap<String, String>,
-    /// Wall time of each stage [s].
-    pub stage_seconds: BTreeMap<String, f64>,
-    /// The odometry.
-    pub odometry: OdometryFigures,
-    /// The map.
-    pub map: MapFigures,
-    /// The localization.
-    pub localization: Report,
-}
-
-/// Figures of the odometry.
-#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
-pub struct OdometryFigures {
-    /// Number of scans.
-    pub scans: usize,
-    /// Scans whose pose was predicted, because they did not fit.
-    pub predicted: usize,
-    /// Length of the path [m].
-    pub path_m: f64,
-    /// Median and 95 % quantile of the time per scan [s].
-    pub seconds_per_scan: Option<[f64; 2]>,
-    /// Errors of the odometry, scan by scan, without loops and adjustment; `null` without a truth.
-    pub scan_by_scan: Option<Box<Report>>,
-    /// Errors after loops were closed and all poses adjusted.
-    pub adjusted: Option<Box<Report>>,
-}
-
-/// Figures of the map.
-#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
-pub struct MapFigures {
-    /// Key scans that the map was built from.
-    pub mapped_frames: usize,
-    /// Length of their path [m].
-    pub path_m: f64,
-    /// Number of triangles.
-    pub triangles: usize,
-    /// Size of the file [MB].
-    pub map_mb: f64,
-    /// Wall time of the build [s].
-    pub seconds: f64,
-}
-
 /// A session: its recording, and the file of its true poses.
 struct Session {
     recording: RecordingConfig,
+    layout: Layout,
     truth: Option<PathBuf>,
     calibration: Option<PathBuf>,
 }
@@ -198,10 +145,7 @@ pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
     let localization = benchmark.localization(located, second.is_some(), &map.folder)?;
     time("3 localization", &localization);
     let report = BenchmarkReport {
-        layout: match args.layout.0 {
-            Some(layout) => layout.name().to_owned(),
-            None => "as the files show".to_owned(),
-        },
+        layout: first.layout.name().to_owned(),
         recording: args.recording.clone(),
         second: args.second.clone(),
         program: version::program()?,
@@ -213,7 +157,7 @@ pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
     };
     claims.begin(&main)?;
     let files = RunFiles::new(&localization.folder.join(RESULT));
-    let page = page::page(&report, &map.folder, &files)?;
+    let page = page::page(&report, &map.folder.join(MAP).with_extension("png"), &files)?;
     output::write_text(&args.output.join("benchmark.html"), &page.to_html())?;
     output::write_json(&main, &report)?;
     claims.finish(&main)?;
@@ -364,6 +308,7 @@ impl Session {
         }
         Ok(Self {
             recording,
+            layout: opened.files.layout,
             truth,
             calibration,
         })
@@ -404,42 +349,6 @@ impl Session {
         });
         keys.extend(of_recording);
         keys
-    }
-}
-
-impl BenchmarkReport {
-    /// Names and values, most important first.
-    fn rows(&self) -> Vec<(&'static str, String)> {
-        let mut rows = Vec::new();
-        let of_odometry = [
-            ("odometry", &self.odometry.scan_by_scan),
-            ("odometry, adjusted", &self.odometry.adjusted),
-        ];
-        for (name, report) in of_odometry {
-            let metrics = report
-                .as_ref()
-                .and_then(|report| report.trajectory.as_ref());
-            let segments = metrics.and_then(|it| it.kitti_segments);
-            rows.extend(segments.map(|it| {
-                let (percent, turn) = (it.translation_percent, it.rotation_deg_per_100_m());
-                (name, format!("{percent:.2} %, {turn:.2} deg/100 m"))
-            }));
-        }
-        for (name, report) in [
-            ("localization", &self.localization.mcl),
-            ("refined", &self.localization.refined),
-        ] {
-            rows.extend(report.as_ref().map(|report| {
-                let position = length(report.metrics.position_m.rmse);
-                let heading_deg = report.metrics.heading_rad.rmse.to_degrees();
-                (name, format!("{position}, {heading_deg:.3} deg"))
-            }));
-        }
-        rows.extend([
-            ("map", format!("{:.1} MB", self.map.map_mb)),
-            ("path", format!("{:.0} m", self.map.path_m)),
-        ]);
-        rows
     }
 }
 

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use anyhow::Result;
 
+use super::figures::BenchmarkReport;
 use super::published::PUBLISHED;
-use super::{BenchmarkReport, MAP};
+use crate::app::report::RunFiles;
 use crate::app::report::pages::{Column, Page, PageElement, Section, Table};
 use crate::app::report::run_page::{PICTURES, definitions, facts, numbers, picture, segments};
-use crate::app::report::{Report, RunFiles};
 
 /// Assembles the page from the figures and the pictures of the stages.
 pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Result<Page> {
@@ -40,8 +40,7 @@ pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Resul
         ("size".to_owned(), format!("{:.1} MB", figures.map_mb)),
         ("time".to_owned(), format!("{:.1} s", figures.seconds)),
     ])];
-    let image = map.join(MAP).with_extension("png");
-    of_map.extend(picture(&image, "The map from above")?);
+    of_map.extend(picture(map, "The map from above")?);
     let mut of_localization = numbers(&report.localization);
     let plots = localized.file("plots");
     for (_, name, caption) in [("", "path.png", "Path"), PICTURES[0], PICTURES[2]] {
@@ -61,7 +60,7 @@ pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Resul
     };
     Ok(Page {
         title: format!("Benchmark on {}", report.recording.display()),
-        verdict: verdict(&report.localization),
+        verdict: report.localization.verdict(),
         subtitle: match &report.second {
             Some(second) => format!("{} localized in its map.", second.display()),
             None => "Every other scan localized in the map of the others.".to_owned(),
@@ -75,10 +74,6 @@ pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Resul
             section("Program and machine", vec![PageElement::Facts(settings)]),
         ],
     })
-}
-
-fn verdict(localization: &Report) -> String {
-    localization.verdict()
 }
 
 /// Figures of peers, as they were published.
