@@ -1,5 +1,7 @@
-//! Fixes of a GNSS receiver: NMEA sentences, rows of a table, KITTI's `oxts`; those of a bag are in its messages.
+//! Fixes of a GNSS receiver: NMEA sentences (feature `bags`), rows of a table, KITTI's `oxts`; those of a bag are in its
+//! messages.
 
+#[cfg(feature = "bags")]
 mod nmea;
 
 use std::path::Path;
@@ -19,13 +21,11 @@ pub fn read(path: &Path) -> Result<GeodeticFixes, RecordingError> {
         return oxts::read_fixes(path)?.checked(path);
     }
     let text = read_text(path)?;
-    let is_sentence = |line: &str| line.trim_start().starts_with('$');
-    let found = if text.lines().any(is_sentence) {
-        nmea::parse(&text)
-    } else {
-        table(&text, path)?
-    };
-    found.checked(path)
+    #[cfg(feature = "bags")]
+    if (text.lines()).any(|line| line.trim_start().starts_with('$')) {
+        return nmea::parse(&text).checked(path);
+    }
+    table(&text, path)?.checked(path)
 }
 
 /// Reads rows of time [s], latitude, longitude [deg], height above the ellipsoid [m] and, optionally, the standard deviations
@@ -117,6 +117,7 @@ mod tests {
         }
     }
 
+    #[cfg(feature = "bags")]
     #[test]
     fn sentences_give_time_position_height_and_deviations_and_damaged_ones_are_counted() {
         let text = "\
