@@ -92,6 +92,9 @@ impl BenchmarkReport {
                 (name, format!("{position}, {heading_deg:.3} deg"))
             }));
         }
+        if self.localization.mcl.is_none() {
+            rows.push(("localization", self.localization.verdict()));
+        }
         rows.extend([
             ("map", format!("{:.1} MB", self.map.map_mb)),
             ("path", format!("{:.0} m", self.map.path_m)),
