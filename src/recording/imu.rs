@@ -97,18 +97,8 @@ impl Recording {
 /// Reads the columns `ax ay az` and `wx wy wz` of KITTI's `oxts/data`, and `oxts/timestamps.txt`.
 fn read_oxts(oxts: &Path) -> Result<Vec<ImuSample>, RecordingError> {
     const COLUMNS: usize = 20;
-    let times_path = oxts.join("timestamps.txt");
-    let times_s = oxts::read_timestamps(&times_path)?;
-    let files: Vec<PathBuf> = oxts::data_files(oxts)?;
-    if files.len() != times_s.len() {
-        return Err(RecordingError::WrongTimes {
-            path: times_path,
-            times: times_s.len(),
-            poses: files.len(),
-        });
-    }
-    let read = |(path, &time_s): (&PathBuf, &f64)| {
-        let rows = read_rows(path)?;
+    let read = |(path, time_s): (PathBuf, f64)| {
+        let rows = read_rows(&path)?;
         let row = rows.first().map_or(&[][..], |(_, row)| row);
         let numbers = row.get(..COLUMNS);
         let numbers = numbers.ok_or_else(|| RecordingError::WrongCount {
@@ -124,7 +114,7 @@ fn read_oxts(oxts: &Path) -> Result<Vec<ImuSample>, RecordingError> {
             force_m_s2: Vector3::from_column_slice(&numbers[11..14]),
         })
     };
-    files.iter().zip(&times_s).map(read).collect()
+    oxts::timed_files(oxts)?.into_iter().map(read).collect()
 }
 
 /// Reads a table.

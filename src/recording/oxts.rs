@@ -53,7 +53,7 @@ pub fn read(oxts: &Path) -> Result<(Vec<Pose3>, Calibration), RecordingError> {
 }
 
 /// The files of the measurements, ascending.
-pub fn data_files(oxts: &Path) -> Result<Vec<PathBuf>, RecordingError> {
+fn data_files(oxts: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     let folder = oxts.join("data");
     let mut files = Vec::new();
     for entry in fs::read_dir(&folder).map_err(RecordingError::read(&folder))? {
@@ -64,6 +64,21 @@ pub fn data_files(oxts: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     }
     files.sort();
     Ok(files)
+}
+
+/// The files of the measurements with the times of `oxts/timestamps.txt` [s].
+pub fn timed_files(oxts: &Path) -> Result<Vec<(PathBuf, f64)>, RecordingError> {
+    let times_file = oxts.join("timestamps.txt");
+    let times_s = read_timestamps(&times_file)?;
+    let files = data_files(oxts)?;
+    if files.len() != times_s.len() {
+        return Err(RecordingError::WrongTimes {
+            path: times_file,
+            times: times_s.len(),
+            poses: files.len(),
+        });
+    }
+    Ok(files.into_iter().zip(times_s).collect())
 }
 
 /// A row of measurements.
@@ -100,23 +115,13 @@ fn read_row(path: &Path) -> Result<(usize, Row), RecordingError> {
 /// Reads the positions of `oxts/data/*.txt` with the times of `oxts/timestamps.txt`. The antenna is where the measuring
 /// unit is, by `calib_imu_to_velo.txt`.
 pub fn read_fixes(oxts: &Path) -> Result<FoundFixes, RecordingError> {
-    let times_file = oxts.join("timestamps.txt");
-    let times_s = read_timestamps(&times_file)?;
-    let files = data_files(oxts)?;
-    if files.len() != times_s.len() {
-        return Err(RecordingError::WrongTimes {
-            path: times_file,
-            times: times_s.len(),
-            poses: files.len(),
-        });
-    }
     let mut found = FoundFixes::default();
-    for (path, time_s) in files.iter().zip(times_s) {
-        let (line, row) = read_row(path)?;
+    for (path, time_s) in timed_files(oxts)? {
+        let (line, row) = read_row(&path)?;
         let [latitude_deg, longitude_deg, height_m, ..] = row.begin;
         if !is_position(latitude_deg, longitude_deg, height_m) {
             return Err(RecordingError::NotOnEarth {
-                path: path.clone(),
+                path,
                 line,
                 row: format!("{latitude_deg} {longitude_deg} {height_m}"),
             });

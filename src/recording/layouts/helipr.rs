@@ -8,7 +8,7 @@ use std::path::Path;
 
 use super::super::error::RecordingError;
 use super::super::layout::{Layout, RecordingFiles};
-use super::super::scan_files::point_table::NumberType::{F32, I32, U8, U16, U32};
+use super::super::scan_files::point_table::NumberType::{self, F32, I32, U8, U16, U32};
 use super::super::scan_files::records::{PointFormat, RecordFormat};
 use super::super::scan_list;
 use super::named::{BodyPoses, NamedLayout, choose};
@@ -24,19 +24,7 @@ pub const HELIPR: NamedLayout = NamedLayout {
 
 /// The lidars, by the names of their folders, and their points.
 static LIDARS: [(&str, RecordFormat); 4] = [
-    (
-        "Aeva",
-        RecordFormat::in_metres(&[
-            ("x", F32),
-            ("y", F32),
-            ("z", F32),
-            ("reflectivity", F32),
-            ("velocity", F32),
-            ("time", I32),
-            ("line", U8),
-            ("intensity", F32),
-        ]),
-    ),
+    ("Aeva", RecordFormat::in_metres(&AEVA)),
     (
         "Avia",
         RecordFormat::in_metres(&[
@@ -75,8 +63,8 @@ static LIDARS: [(&str, RecordFormat); 4] = [
     ),
 ];
 
-/// Points of the Aeva in its first sessions.
-const AEVA_WITHOUT_INTENSITY: RecordFormat = RecordFormat::in_metres(&[
+/// Points of the Aeva.
+static AEVA: [(&str, NumberType); 8] = [
     ("x", F32),
     ("y", F32),
     ("z", F32),
@@ -84,7 +72,11 @@ const AEVA_WITHOUT_INTENSITY: RecordFormat = RecordFormat::in_metres(&[
     ("velocity", F32),
     ("time", I32),
     ("line", U8),
-]);
+    ("intensity", F32),
+];
+
+/// Those of its first sessions have no intensity.
+static AEVA_WITHOUT_INTENSITY: RecordFormat = RecordFormat::in_metres(AEVA.split_at(7).0);
 
 /// The last scan of the Aeva without intensities [s].
 const LAST_WITHOUT_INTENSITY_S: f64 = 1_691_936_557.946_849;
