@@ -142,7 +142,7 @@ Examples:
   fpmcl compare --collect                     tables of the finished runs")]
     Compare(CompareArgs),
 
-    /// Measure odometry, a map and a localization on a public sequence, beside published figures.
+    /// Measure odometry, a map and a localization on a public sequence, next to published figures.
     #[command(after_help = "\
 Examples:
   fpmcl benchmark kitti sequences/07/         every other scan in a map of the others

@@ -26,7 +26,7 @@ use crate::app::run::arguments::numbers;
 use crate::app::run::{Claims, Context, RecordingArgs, RunArgs};
 use crate::app::settings::LocalizationConfig;
 
-/// Files beside the scans and the map, of `localize` and `live`.
+/// Files besides the scans and the map, of `localize` and `live`.
 #[derive(Clone, Debug, Args, Serialize)]
 pub struct DriveArgs {
     /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
