@@ -4,20 +4,29 @@
 //! while it is written, so that one that a killed process left is known by being unlocked.
 //!
 //! Nothing is written below a claimed folder once its path leads elsewhere, such as through a link that
-//! replaced the folder while the program ran.
+//! replaced the folder while the program ran. On Linux files are opened relative to the folder that was claimed, so that
+//! this holds between a check and a write, too.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read as _, Write};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tempfile::{Builder, NamedTempFile};
 
 /// Temporary files of writes that are under way.
 static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
-/// Claimed folders and what they were when they were claimed.
-static CLAIMED: Mutex<Vec<(PathBuf, Identity)>> = Mutex::new(Vec::new());
+/// Claimed folders.
+static CLAIMED: Mutex<Vec<Claimed>> = Mutex::new(Vec::new());
+
+/// A folder as it was when it was claimed.
+#[derive(Clone)]
+struct Claimed {
+    path: PathBuf,
+    identity: Identity,
+    folder: Arc<Folder>,
+}
 
 /// What tells a folder from another at the same path: device and inode.
 #[cfg(unix)]
@@ -25,6 +34,13 @@ type Identity = (u64, u64);
 /// What tells a folder from another at the same path: the path without links.
 #[cfg(not(unix))]
 type Identity = PathBuf;
+
+/// An open folder, which keeps its path valid when it is moved.
+#[cfg(target_os = "linux")]
+type Folder = std::os::fd::OwnedFd;
+/// Nothing where paths cannot begin at an open folder.
+#[cfg(not(target_os = "linux"))]
+type Folder = ();
 
 const PREFIX: &str = ".fpmcl-";
 /// Random characters in the name of a temporary file.
@@ -51,19 +67,21 @@ pub struct AtomicFile {
     path: PathBuf,
     temporary: NamedTempFile,
     _unfinished: Unfinished,
+    place: Place,
 }
 
 impl AtomicFile {
     /// Creates the temporary file in the folder of `path`, which must exist.
     pub fn create(path: &Path) -> io::Result<Self> {
-        check_claimed(path)?;
+        let place = Place::of(path)?;
         let mut unfinished = unfinished();
-        let temporary = temporary_next_to(path)?;
+        let temporary = temporary_next_to(&place.path)?;
         unfinished.push(temporary.path().to_owned());
         Ok(Self {
             path: path.to_owned(),
             _unfinished: Unfinished(temporary.path().to_owned()),
             temporary,
+            place,
         })
     }
 
@@ -75,7 +93,7 @@ impl AtomicFile {
     /// Renames the temporary file to the path.
     pub fn persist(self) -> io::Result<()> {
         check_claimed(&self.path)?;
-        let persisted = self.temporary.persist(&self.path);
+        let persisted = self.temporary.persist(&self.place.path);
         persisted.map(drop).map_err(|failed| failed.error)
     }
 }
@@ -91,22 +109,97 @@ impl Drop for UnlockedOnDrop {
     }
 }
 
-/// Remembers which folder a path is now; [`check_claimed`] compares.
-pub fn claim_folder(folder: &Path) -> io::Result<()> {
-    let found = identity(folder)?;
-    let mut claimed = lock(&CLAIMED);
-    claimed.retain(|(path, _)| path != folder);
-    claimed.push((folder.to_owned(), found));
+/// Where a file is written: below a claimed folder, at a path that begins at the folder that was claimed.
+pub struct Place {
+    /// The path, valid as long as this lives.
+    pub path: PathBuf,
+    _folder: Option<Arc<Folder>>,
+}
+
+impl Place {
+    /// The place of a file; an error if a claimed folder above it was replaced, or a folder between them is a link.
+    pub fn of(path: &Path) -> io::Result<Self> {
+        let elsewhere = Self {
+            path: path.to_owned(),
+            _folder: None,
+        };
+        let Some((claimed, below)) = check_claimed(path)? else {
+            return Ok(elsewhere);
+        };
+        let Some(name) = path.file_name() else {
+            return Ok(elsewhere);
+        };
+        Ok(match inside(&claimed.folder, &below)? {
+            Some((folder, path)) => Self {
+                path: path.join(name),
+                _folder: Some(folder),
+            },
+            None => elsewhere,
+        })
+    }
+}
+
+/// The open folder at a path below an open one, through no link, and its path; `None` where there are no such paths.
+#[cfg(target_os = "linux")]
+fn inside(folder: &Arc<Folder>, below: &Path) -> io::Result<Option<(Arc<Folder>, PathBuf)>> {
+    use std::os::fd::AsRawFd as _;
+    let mut folder = Arc::clone(folder);
+    for name in below {
+        folder = Arc::new(rustix::fs::openat(
+            &*folder,
+            name,
+            FOLDER | rustix::fs::OFlags::NOFOLLOW,
+            rustix::fs::Mode::empty(),
+        )?);
+    }
+    let path = Path::new("/proc/self/fd").join(folder.as_raw_fd().to_string());
+    Ok(path.is_dir().then_some((folder, path)))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn inside(_folder: &Arc<Folder>, _below: &Path) -> io::Result<Option<(Arc<Folder>, PathBuf)>> {
+    Ok(None)
+}
+
+/// How a folder is opened that paths begin at: it need not be readable.
+#[cfg(target_os = "linux")]
+const FOLDER: rustix::fs::OFlags = rustix::fs::OFlags::PATH
+    .union(rustix::fs::OFlags::DIRECTORY)
+    .union(rustix::fs::OFlags::CLOEXEC);
+
+#[cfg(target_os = "linux")]
+fn open_folder(path: &Path) -> io::Result<Folder> {
+    Ok(rustix::fs::open(path, FOLDER, rustix::fs::Mode::empty())?)
+}
+
+#[cfg(not(target_os = "linux"))]
+fn open_folder(_path: &Path) -> io::Result<Folder> {
     Ok(())
 }
 
-/// An error if a claimed folder above `path` was replaced, or a folder between them is a link.
-pub fn check_claimed(path: &Path) -> io::Result<()> {
-    for (folder, found) in lock(&CLAIMED).iter() {
+/// Remembers which folder a path is now; [`check_claimed`] compares.
+pub fn claim_folder(path: &Path) -> io::Result<()> {
+    let claim = Claimed {
+        path: path.to_owned(),
+        identity: identity(path)?,
+        folder: Arc::new(open_folder(path)?),
+    };
+    let mut claimed = lock(&CLAIMED);
+    claimed.retain(|other| other.path != path);
+    claimed.push(claim);
+    Ok(())
+}
+
+/// An error if a claimed folder above `path` was replaced, or a folder between them is a link. Returns the claimed folder,
+/// if there is one, and the path from there to the folder of `path`.
+fn check_claimed(path: &Path) -> io::Result<Option<(Claimed, PathBuf)>> {
+    let mut innermost: Option<(Claimed, PathBuf)> = None;
+    for claimed in lock(&CLAIMED).iter() {
+        let folder = &claimed.path;
         let Ok(below) = folder_of(path).strip_prefix(folder) else {
             continue;
         };
-        if identity(folder)? != *found {
+        if identity(folder)? != claimed.identity {
             return Err(replaced(folder));
         }
         for inner in below.ancestors().filter(|it| !it.as_os_str().is_empty()) {
@@ -115,8 +208,13 @@ pub fn check_claimed(path: &Path) -> io::Result<()> {
                 return Err(replaced(&inner));
             }
         }
+        let is_inner =
+            (innermost.as_ref()).is_none_or(|(other, _)| folder.starts_with(&other.path));
+        if is_inner {
+            innermost = Some((claimed.clone(), below.to_owned()));
+        }
     }
-    Ok(())
+    Ok(innermost)
 }
 
 fn replaced(folder: &Path) -> io::Error {
@@ -207,10 +305,19 @@ pub fn temporary_next_to(path: &Path) -> io::Result<NamedTempFile> {
         .prefix(&temporary_prefix(path))
         .rand_bytes(RANDOM)
         .suffix(SUFFIX)
-        .tempfile_in(folder_of(path))?;
+        .tempfile_in(folder_of(path))
+        .map_err(without_path)?;
     // Some file systems have no locks; what is left there stays.
     let _ = temporary.as_file().try_lock();
     Ok(temporary)
+}
+
+/// The error of the system in one that names a temporary file, which means nothing to users.
+fn without_path(error: io::Error) -> io::Error {
+    let inner = error.get_ref().and_then(|inner| inner.source());
+    let inner = inner.and_then(|inner| inner.downcast_ref::<io::Error>());
+    let code = inner.and_then(io::Error::raw_os_error);
+    code.map_or(error, io::Error::from_raw_os_error)
 }
 
 /// Removes the temporary files of `path` that killed processes left, and if it is a folder, those
@@ -326,6 +433,31 @@ mod tests {
         let read = |name: &str| fs::read_to_string(path(name)).unwrap();
         assert_eq!(read("others/frames.csv"), "theirs");
         assert_eq!(read("moved/frames.csv"), "ours");
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_place_that_was_checked_stays_in_the_folder_that_was_claimed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        for name in ["results/plots", "others/plots"] {
+            fs::create_dir_all(path(name)).unwrap();
+        }
+        claim_folder(&path("results")).unwrap();
+        let places = ["results/frames.csv", "results/plots/map.png"];
+        let places = places.map(|name| Place::of(&path(name)).unwrap());
+        fs::rename(path("results"), path("moved")).unwrap();
+        std::os::unix::fs::symlink(path("others"), path("results")).unwrap();
+        for place in &places {
+            fs::write(&place.path, "ours").unwrap();
+        }
+        for name in ["frames.csv", "plots/map.png"] {
+            assert_eq!(
+                fs::read_to_string(path("moved").join(name)).unwrap(),
+                "ours"
+            );
+            assert!(!path("others").join(name).exists());
+        }
     }
 
     #[test]

@@ -14,6 +14,7 @@ use tracing_subscriber::{Layer as _, fmt};
 
 use crate::app::run::progress::Progress;
 use crate::app::run::visible::visible_in_line;
+use crate::files::Place;
 
 /// Starts logging; a second call in the same process has no effect.
 pub(crate) fn start(level: LevelFilter, progress: &Progress, log: &RunLog) {
@@ -92,8 +93,8 @@ pub struct LogGuard {
 impl RunLog {
     /// Writes all messages into a new file until the guard is dropped.
     pub fn write_to(&self, path: &Path) -> anyhow::Result<LogGuard> {
-        let file =
-            File::create(path).with_context(|| format!("cannot create {}", path.display()))?;
+        let file = Place::of(path).and_then(|place| File::create(&place.path));
+        let file = file.with_context(|| format!("cannot create {}", path.display()))?;
         let previous = self.replace(Some(file));
         let log = self.clone();
         Ok(LogGuard { log, previous })

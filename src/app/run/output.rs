@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::failure::NOT_LOCALIZED;
 use super::visible::{visible, visible_in_line};
 use crate::app::settings::to_yaml;
-use crate::files::{check_claimed, write_atomically};
+use crate::files::{Place, write_atomically};
 
 /// Writes a file atomically.
 pub fn write_file<E: Into<anyhow::Error>>(
@@ -131,7 +131,7 @@ pub fn create_folder(folder: &Path) -> anyhow::Result<()> {
 
 /// Creates a folder in one that must exist.
 pub fn create_subfolder(folder: &Path) -> anyhow::Result<()> {
-    match check_claimed(folder).and_then(|()| fs::create_dir(folder)) {
+    match Place::of(folder).and_then(|place| fs::create_dir(&place.path)) {
         Err(error) if !folder.is_dir() => {
             Err(error).with_context(|| format!("cannot create {}", folder.display()))
         }
@@ -141,7 +141,7 @@ pub fn create_subfolder(folder: &Path) -> anyhow::Result<()> {
 
 /// Removes a file, if it exists.
 pub fn remove_if_exists(path: &Path) -> anyhow::Result<()> {
-    match check_claimed(path).and_then(|()| fs::remove_file(path)) {
+    match Place::of(path).and_then(|place| fs::remove_file(&place.path)) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
             Err(error).with_context(|| format!("cannot remove {}", path.display()))
         }

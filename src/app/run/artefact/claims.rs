@@ -23,7 +23,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 
 use crate::app::run::output;
 use crate::files::{
-    check_claimed, claim_folder, folder_of, remove_abandoned, require_no_link, temporary_next_to,
+    Place, claim_folder, folder_of, remove_abandoned, require_no_link, temporary_next_to,
 };
 
 /// File of the claims in each folder.
@@ -250,8 +250,8 @@ impl Claims {
         }
         let path = self.folder.join(CLAIMS_FILE);
         require_no_link(&path)
-            .and_then(|()| check_claimed(&path))
-            .and_then(|()| append(&path, &lines))
+            .and_then(|()| Place::of(&path))
+            .and_then(|place| append(&place.path, &lines))
             .with_context(|| format!("cannot write {}", path.display()))
     }
 }
