@@ -95,6 +95,42 @@ fn one_session_without_a_truth_is_divided_and_says_that_it_has_no_errors() {
 }
 
 #[test]
+fn scans_and_truths_that_have_changed_are_measured_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, STREET);
+    benchmark(folder).succeeds();
+    let path = folder.join("results/benchmark/benchmark.json");
+    let seconds = |stage: &str| json(&path)["stage_seconds"][stage].clone();
+    let stages = ["1 odometry", "2 map", "3 localization"];
+    let before = stages.map(seconds);
+    // Without its last points, the scan of a session that is localized only.
+    let scan = folder.join("street/drive_2/velodyne/000020.bin");
+    let points = fs::read(&scan).unwrap();
+    fs::write(&scan, &points[..points.len() - 1600]).unwrap();
+    benchmark(folder).succeeds();
+    let after = stages.map(seconds);
+    assert_eq!(after[..2], before[..2]);
+    assert_ne!(after[2], before[2]);
+    // Another truth of the first session.
+    let poses = folder.join("street/drive_1/poses.txt");
+    let truth = fs::read_to_string(&poses).unwrap();
+    fs::write(&poses, truth.replacen('1', "0.99", 1)).unwrap();
+    benchmark(folder).succeeds();
+    assert_ne!(stages.map(seconds)[0], before[0]);
+}
+
+#[test]
+fn a_key_that_no_stage_has_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, STREET);
+    let call = benchmark(folder).set("num_partikles", "500");
+    call.fails_with(&["num_partikles", "localize"]);
+    assert!(!folder.join("results/benchmark/stages").exists());
+}
+
+#[test]
 fn a_layout_that_nobody_knows_is_refused_with_those_that_are_read() {
     let call = fpmcl("benchmark").with("kiti").with("drive");
     call.rejects_usage_with(&["kiti", "kitti", "mulran", "auto"]);

@@ -11,10 +11,10 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::simulate::{self, Existing};
+use super::stages::{path_value, settings_of};
 use super::{build_map, localize, refine};
 use crate::app::report::Report;
 use crate::app::report::map::BuildReport;
-use crate::app::run::arguments::yaml;
 use crate::app::run::{Context, Form, MachineArgs, Printed};
 use crate::app::settings::{self, BuildMapConfig, LocalizationConfig};
 use crate::configuration::Configuration;
@@ -78,7 +78,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
     let map: BuildMapConfig = configured(
         &first,
         &[
-            ("mesh_file", path(&map_file)),
+            ("mesh_file", path_value(&map_file)),
             ("holdout_step", json!(10)),
             ("map.seed", json!(seed)),
             ("output.plots", json!(false)),
@@ -90,11 +90,17 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
     let localization: LocalizationConfig = configured(
         &second,
         &[
-            ("map_input.map_file", path(&map_file)),
-            ("result_path", path(&args.output.join("localization.npz"))),
+            ("map_input.map_file", path_value(&map_file)),
+            (
+                "result_path",
+                path_value(&args.output.join("localization.npz")),
+            ),
             ("pose_tracking", json!(true)),
             ("motion.odometry", json!("file")),
-            ("motion.odometry_file", path(&second.join("odometry.txt"))),
+            (
+                "motion.odometry_file",
+                path_value(&second.join("odometry.txt")),
+            ),
             ("tracker.localizer.num_particles", json!(1000)),
             ("tracker.seed", json!(seed)),
         ],
@@ -128,17 +134,17 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
 /// A configuration with the recording of a drive, its true poses, and further keys; existing output is replaced.
 fn configured<T: Configuration>(drive: &Path, keys: &[(&str, Value)]) -> Result<T> {
     let keys_of_drive = [
-        ("recording.scan_folder", path(&drive.join("velodyne"))),
-        ("given_poses.pose_file", path(&drive.join("poses.txt"))),
-        ("given_poses.calib_file", path(&drive.join("calib.txt"))),
+        ("recording.scan_folder", path_value(&drive.join("velodyne"))),
+        (
+            "given_poses.pose_file",
+            path_value(&drive.join("poses.txt")),
+        ),
+        (
+            "given_poses.calib_file",
+            path_value(&drive.join("calib.txt")),
+        ),
         ("output.force", json!(true)),
     ];
-    let keys = keys.iter().chain(&keys_of_drive);
-    let settings = keys.map(|(key, value)| ((*key).to_owned(), yaml(value)));
-    let settings: Vec<(String, String)> = settings.collect();
+    let settings = settings_of(&[keys, &keys_of_drive].concat());
     Ok(settings::with_settings(T::default(), &settings)?)
-}
-
-fn path(path: &Path) -> Value {
-    json!(path.to_string_lossy())
 }

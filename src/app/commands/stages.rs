@@ -3,7 +3,9 @@
 use std::path::Path;
 
 use anyhow::{Context as _, Result};
+use serde_json::{Value, json};
 
+use crate::app::run::arguments::yaml;
 use crate::app::run::input::is_bag;
 use crate::app::run::{Context, input, memory};
 use crate::app::settings::{
@@ -14,6 +16,18 @@ use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::odometry::GnssConstraints;
 use crate::recording::{PoseTrack, Recording, RecordingError, is_topic};
 use crate::sensor::{Sensor, SensorConfig};
+
+/// Values of keys, as those of `--set`.
+pub fn settings_of(keys: &[(&str, Value)]) -> Vec<(String, String)> {
+    let keys = keys.iter();
+    keys.map(|(key, value)| ((*key).to_owned(), yaml(value)))
+        .collect()
+}
+
+/// A path as the value of a key.
+pub fn path_value(path: &Path) -> Value {
+    json!(path.to_string_lossy())
+}
 
 /// A recording, and the poses that are given with it.
 #[derive(Clone, Copy)]
@@ -35,7 +49,7 @@ impl<'a> RecordingInputs<'a> {
         let folder = self.recording.scan_folder.as_path();
         let mut files = vec![("scan_folder", folder)];
         let poses = self.poses.pose_file.as_deref();
-        let poses = poses.filter(|path| !(is_topic(path) && is_bag(folder)));
+        let poses = poses.and_then(|path| self.recording.file(path));
         files.extend(poses.map(|path| ("pose_file", path)));
         let calibration = self.poses.calib_file.as_deref();
         files.extend(calibration.map(|path| ("calib_file", path)));
@@ -69,12 +83,18 @@ impl<'a> RecordingInputs<'a> {
     }
 }
 
+impl RecordingConfig {
+    /// What is read with the recording, unless it is a topic of its bag.
+    pub fn file<'a>(&self, path: &'a Path) -> Option<&'a Path> {
+        let is_in_bag = is_topic(path) && is_bag(&self.scan_folder);
+        (!is_in_bag).then_some(path)
+    }
+}
+
 impl InertialConfig {
     /// The file of the measurements, which is not a topic of the bag, and its key.
     pub fn files(&self, recording: &RecordingConfig) -> Option<(&'static str, &Path)> {
-        let path = self.imu_file.as_deref()?;
-        let is_file = !(is_topic(path) && is_bag(&recording.scan_folder));
-        is_file.then_some(("imu_file", path))
+        Some(("imu_file", recording.file(self.imu_file.as_deref()?)?))
     }
 
     /// Warns where a sensor is named that poses of another origin leave without use.
@@ -111,9 +131,7 @@ impl PoseInputConfig {
 impl GnssInputConfig {
     /// The file and its key, if it is not a topic of the bag.
     pub fn file(&self, recording: &RecordingConfig) -> Option<(&'static str, &Path)> {
-        let path = self.gnss_file.as_deref()?;
-        let is_in_bag = is_topic(path) && is_bag(&recording.scan_folder);
-        (!is_in_bag).then_some(("gnss_file", path))
+        Some(("gnss_file", recording.file(self.gnss_file.as_deref()?)?))
     }
 
     /// Reads the positions of a recording, where there are some.

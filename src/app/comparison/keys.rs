@@ -15,12 +15,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context as _, Result};
-use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::Value;
 
 use super::plan::PlannedRun;
-use crate::app::run::artefact::hash::{hash_of_file, hash_of_scan, hash_of_texts};
+use crate::app::run::artefact::hash::{hash_of_file, hash_of_recording, hash_of_texts};
 use crate::app::run::input::is_bag;
 use crate::app::run::version;
 use crate::app::settings::{PoseInputConfig, RecordingConfig};
@@ -97,23 +96,12 @@ impl KeyCache {
             }
             Input::Scans(config) if is_bag(&config.scan_folder) => self.file(&config.scan_folder),
             Input::Scans(config) => self.once(format!("{config:?}"), || {
-                let recording = Recording::open_with(
+                hash_of_recording(&Recording::open_with(
                     &config.scan_folder,
                     config.layout,
                     config.topic.as_deref(),
                     &config.frames,
-                )?;
-                let mut hashes = (recording.frames.par_iter())
-                    .map(|frame| {
-                        let content = hash_of_scan(&frame.read()?);
-                        Ok(format!("{} {} {content}", frame.number, frame.time_s))
-                    })
-                    .collect::<Result<Vec<String>>>()?;
-                let files = recording.files;
-                for path in files.poses.iter().chain(&files.calibration) {
-                    hashes.push(hash_of_file(path)?);
-                }
-                Ok(hash_of_texts(&hashes))
+                )?)
             }),
             Input::Topic(name) => Ok(format!("{name:?}")),
             Input::File(path) => self.file(path),

@@ -1,4 +1,4 @@
-//! `benchmark`: odometry, map and localization of a public sequence, beside published figures.
+//! `benchmark`: odometry, map and localization of a public sequence, next to published figures.
 //!
 //! ```text
 //! odometry      the first session by its scans alone, compared with its truth by KITTI's rules
@@ -6,8 +6,8 @@
 //! localization  of the second session, or of the other scans, and refined
 //! ```
 //!
-//! Each stage has a folder `stages/KEY`, whose key is a hash of its configuration and of the program: what is finished is
-//! used again.
+//! Each stage has a folder `stages/KEY`, whose key is a hash of its configuration, of the scans and poses that it reads and of
+//! the program: what is finished is used again.
 
 mod figures;
 mod page;
@@ -16,7 +16,7 @@ mod published;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 use clap::Args;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -24,11 +24,10 @@ use serde_json::{Value, json};
 
 pub use self::figures::BenchmarkReport;
 use self::figures::OdometryFigures;
-use super::stages::RecordingInputs;
+use super::stages::{RecordingInputs, path_value, settings_of};
 use super::{build_map, evaluate, localize, odometry, refine};
 use crate::app::report::{Report, RunFiles};
-use crate::app::run::arguments::yaml;
-use crate::app::run::artefact::hash::hash_of_texts;
+use crate::app::run::artefact::hash::{hash_of_file, hash_of_recording, hash_of_texts};
 use crate::app::run::artefact::{self, SharedResult};
 use crate::app::run::{Context, Form, MachineArgs, Outputs, Printed, machine, output, version};
 use crate::app::settings::{
@@ -90,6 +89,23 @@ pub struct BenchmarkArgs {
     pub machine: MachineArgs,
 }
 
+impl BenchmarkArgs {
+    /// Requires that each key of `--set` is one of some stage.
+    fn require_known_keys(&self) -> Result<()> {
+        for (key, _) in &self.settings {
+            let is_known = settings::has_key::<OdometryCommandConfig>(key)?
+                || settings::has_key::<BuildMapConfig>(key)?
+                || settings::has_key::<LocalizationConfig>(key)?
+                || settings::has_key::<EvaluationConfig>(key)?;
+            ensure!(
+                is_known,
+                "--set {key}: neither odometry nor build-map, localize nor evaluate has this key; `fpmcl localize --print-config` and that of the others show their keys"
+            );
+        }
+        Ok(())
+    }
+}
+
 /// A layout that was named; `None`: as the files show.
 #[derive(Clone, Copy, Debug)]
 pub struct LayoutArg(pub Option<Layout>);
@@ -110,6 +126,8 @@ struct Session {
     layout: Layout,
     truth: Option<PathBuf>,
     calibration: Option<PathBuf>,
+    /// Hash of the scans, their times and the true poses.
+    content: String,
 }
 
 /// Runs the stages that are not finished, and writes the page and the file of figures.
@@ -124,6 +142,7 @@ pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
         force: true,
     }
     .prepare()?;
+    args.require_known_keys()?;
     let first = Session::open(args, &args.recording, &args.topic, &args.truth)?;
     let second = match &args.second {
         Some(folder) => {
@@ -183,7 +202,7 @@ impl Benchmark<'_> {
     /// Finds the poses of a session by its scans, and their errors.
     fn odometry(&self, session: &Session) -> Result<SharedResult> {
         let config: OdometryCommandConfig = self.configured(session.keys(None, false))?;
-        self.stage("odometry", &config, |folder| {
+        self.stage("odometry", &config, &session.content, |folder| {
             let config = OdometryCommandConfig {
                 output_folder: folder.to_owned(),
                 ..config.clone()
@@ -196,8 +215,11 @@ impl Benchmark<'_> {
                 }
                 let evaluated = folder.join(format!("{name}_evaluation"));
                 let keys = [
-                    ("result_file", path(&folder.join(format!("{name}_tum.txt")))),
-                    ("output_folder", path(&evaluated)),
+                    (
+                        "result_file",
+                        path_value(&folder.join(format!("{name}_tum.txt"))),
+                    ),
+                    ("output_folder", path_value(&evaluated)),
                 ];
                 let keys = keys.into_iter().chain(session.evaluation_keys());
                 let config: EvaluationConfig = self.configured(keys.collect())?;
@@ -219,7 +241,7 @@ impl Benchmark<'_> {
         let mut keys = session.keys(Some(0), is_whole);
         keys.extend(session.truth_keys());
         let config: BuildMapConfig = self.configured(keys)?;
-        self.stage("map", &config, |folder| {
+        self.stage("map", &config, &session.content, |folder| {
             let config = BuildMapConfig {
                 mesh_file: folder.join(MAP),
                 ..config.clone()
@@ -233,9 +255,9 @@ impl Benchmark<'_> {
     fn localization(&self, session: &Session, is_whole: bool, map: &Path) -> Result<SharedResult> {
         let mut keys = session.keys(Some(1), is_whole);
         keys.extend(session.truth_keys());
-        keys.push(("map_input.map_file", path(&map.join(MAP))));
+        keys.push(("map_input.map_file", path_value(&map.join(MAP))));
         let config: LocalizationConfig = self.configured(keys)?;
-        self.stage("localization", &config, |folder| {
+        self.stage("localization", &config, &session.content, |folder| {
             let config = LocalizationConfig {
                 result_path: folder.join(RESULT),
                 ..config.clone()
@@ -252,21 +274,19 @@ impl Benchmark<'_> {
         &self,
         name: &str,
         config: &impl Serialize,
+        content: &str,
         make: impl FnOnce(&Path) -> Result<()>,
     ) -> Result<SharedResult> {
         let text = serde_json::to_string(config)?;
-        let key = hash_of_texts(&[name, &text, version::executable_hash()?]);
+        let key = hash_of_texts(&[name, &text, content, version::executable_hash()?]);
         let folder = self.args.output.join("stages");
         artefact::get_or_create(&folder, &format!("{name}-{}", &key[..16]), make)
     }
 
     /// A configuration with keys, and with those settings of the command line that it has.
     fn configured<T: Configuration>(&self, keys: Vec<(&str, Value)>) -> Result<T> {
-        let mut given: Vec<(String, String)> = keys
-            .into_iter()
-            .map(|(key, value)| (key.to_owned(), yaml(&value)))
-            .collect();
-        given.push(("output.force".to_owned(), "true".to_owned()));
+        let mut given = settings_of(&keys);
+        given.extend(settings_of(&[("output.force", json!(true))]));
         if let Some(seed) = self.args.seed
             && settings::has_key::<T>("seed")?
         {
@@ -306,17 +326,25 @@ impl Session {
                 folder.display()
             );
         }
+        let mut content = vec![hash_of_recording(&opened)?];
+        for file in truth.iter().chain(&calibration) {
+            content.push(hash_of_file(file)?);
+        }
         Ok(Self {
             recording,
             layout: opened.files.layout,
             truth,
             calibration,
+            content: hash_of_texts(&content),
         })
     }
 
     /// Keys of the recording: of all scans, or of every other one from `start` on.
     fn keys(&self, start: Option<usize>, is_whole: bool) -> Vec<(&'static str, Value)> {
-        let mut keys = vec![("recording.scan_folder", path(&self.recording.scan_folder))];
+        let mut keys = vec![(
+            "recording.scan_folder",
+            path_value(&self.recording.scan_folder),
+        )];
         let layout = self.recording.layout.map(|layout| json!(layout));
         keys.extend(layout.map(|layout| ("recording.layout", layout)));
         let topic = self.recording.topic.as_ref();
@@ -336,7 +364,7 @@ impl Session {
         ];
         let known = keys
             .into_iter()
-            .filter_map(|(key, file)| Some((key, path(file.as_ref()?))));
+            .filter_map(|(key, file)| Some((key, path_value(file.as_ref()?))));
         known.collect()
     }
 
@@ -365,8 +393,4 @@ fn with_nulls<const N: usize>(mut value: Value, names: [&str; N]) -> Value {
         value[name] = Value::Null;
     }
     value
-}
-
-fn path(path: &Path) -> Value {
-    json!(path.to_string_lossy())
 }

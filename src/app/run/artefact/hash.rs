@@ -8,7 +8,7 @@ use blake3::Hash;
 use rayon::prelude::*;
 
 use crate::lidar::Scan;
-use crate::recording::{Frame, RecordingError};
+use crate::recording::{Frame, Recording, RecordingError};
 
 /// Hash of a file, or of those in a folder, in the order of their names.
 pub fn hash_of_file(path: &Path) -> Result<String> {
@@ -37,6 +37,21 @@ pub fn hash_of_texts(parts: &[impl AsRef<str>]) -> String {
         hasher.update(part.as_bytes());
     }
     hasher.finalize().to_hex()[..32].to_owned()
+}
+
+/// Hash of the scans of a recording with their numbers and times, and of its files of poses and calibration.
+pub fn hash_of_recording(recording: &Recording) -> Result<String> {
+    let mut hashes = (recording.frames.par_iter())
+        .map(|frame| {
+            let content = hash_of_scan(&frame.read()?);
+            Ok(format!("{} {} {content}", frame.number, frame.time_s))
+        })
+        .collect::<Result<Vec<String>>>()?;
+    let files = &recording.files;
+    for path in files.poses.iter().chain(&files.calibration) {
+        hashes.push(hash_of_file(path)?);
+    }
+    Ok(hash_of_texts(&hashes))
 }
 
 /// Hash of the scans of frames, in order.
