@@ -73,7 +73,7 @@
 //!
 //! | layer | modules |
 //! |---|---|
-//! | foundations | `files`, [`geometry`], [`memory`], `random`, `shared_bytes`, `simd`, `statistics`, [`validation`] |
+//! | foundations | [`file_path`], `files`, [`geometry`], [`memory`], `random`, `shared_bytes`, `simd`, `statistics`, [`validation`] |
 //! | configurations as texts, with a feature | `configuration` |
 //! | sensor, rays and Earth | [`georeference`], [`inertial`], [`lidar`], `raycasting` |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
@@ -100,6 +100,7 @@
 )]
 
 // Foundations.
+pub mod file_path;
 mod files;
 pub mod geometry;
 pub mod memory;

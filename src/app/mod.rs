@@ -21,16 +21,12 @@ use clap::Parser as _;
 
 use cli::Cli;
 use run::visible::visible_in_line;
-use run::{Context, arguments, failure, output};
+use run::{Context, failure, output};
 
 /// The program: parses a command line, whose first argument is the name of the program, starts logging, runs the
 /// command, and reports its error; returns the exit code. Requests for help end the process.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let arguments: Vec<OsString> = arguments.into_iter().collect();
-    if let Err(error) = arguments::require_text(&arguments) {
-        failure::report(&error, failure::POSES);
-        return 1;
-    }
     let cli = match Cli::try_parse_from(&arguments) {
         Ok(cli) => cli,
         Err(error) if error.use_stderr() => {

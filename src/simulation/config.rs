@@ -14,6 +14,7 @@ use super::odometry::SimulatedOdometryConfig;
 use super::scanner::ScannerConfig;
 use super::street_config::StreetConfig;
 use super::traffic::TrafficConfig;
+use crate::file_path::FilePath;
 use crate::memory::MemoryError;
 use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 
@@ -25,8 +26,8 @@ use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 #[serde(default, deny_unknown_fields)]
 pub struct SimulationConfig {
     /// Folder of the drives: drive n is written to `drive_n` below it.
-    #[default(PathBuf::from("data/street"))]
-    pub output_folder: PathBuf,
+    #[default("data/street".into())]
+    pub output_folder: FilePath,
     /// Seed of the street and of all noise.
     #[default(1)]
     pub seed: u64,
@@ -37,9 +38,9 @@ pub struct SimulationConfig {
     #[default(-1)]
     pub n_scans: i64,
     /// KITTI poses to drive along, instead of `path`.
-    pub path_pose_file: Option<PathBuf>,
+    pub path_pose_file: Option<FilePath>,
     /// Calibration of those poses; null: `calib.txt` next to them.
-    pub path_calib_file: Option<PathBuf>,
+    pub path_calib_file: Option<FilePath>,
     /// Segments of the path.
     #[default(vec![ PathSegment::new(45.0, 0.0, 0.0), PathSegment::new(25.0, 55.0, 0.0), PathSegment::new(35.0, -8.0, 7.0), PathSegment::new(20.0, 0.0, -6.0), PathSegment::new(25.0, -75.0, 0.0), PathSegment::new(60.0, 12.0, 0.0), PathSegment::new(20.0, -60.0, 1.0), PathSegment::new(30.0, 0.0, 1.0), ])]
     pub path: Vec<PathSegment>,

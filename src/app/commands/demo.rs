@@ -1,7 +1,7 @@
 //! `demo`: simulation, map, localization and refinement in one command.
 
 use std::num::NonZeroUsize;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
@@ -18,6 +18,7 @@ use crate::app::report::map::BuildReport;
 use crate::app::run::{Context, Form, MachineArgs, Printed};
 use crate::app::settings::{self, BuildMapConfig, LocalizationConfig};
 use crate::configuration::Configuration;
+use crate::file_path::FilePath;
 use crate::simulation::SimulationConfig;
 
 /// Arguments of `demo`.
@@ -25,7 +26,7 @@ use crate::simulation::SimulationConfig;
 pub struct DemoArgs {
     /// Output folder.
     #[arg(long, value_name = "FOLDER", default_value = "results/demo")]
-    pub output: PathBuf,
+    pub output: FilePath,
 
     /// Scans per drive; 160 by default.
     #[arg(long, value_name = "N")]
@@ -61,7 +62,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
     let seed = args.seed.unwrap_or(1);
     let street = args.output.join("street");
     let drive = |number: u32| SimulationConfig {
-        output_folder: street.clone(),
+        output_folder: street.clone().into(),
         seed,
         drive: number,
         n_scans: args.frames.map_or(FRAMES, usize::from) as i64,

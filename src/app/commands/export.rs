@@ -75,10 +75,10 @@ pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
 pub fn check(args: &ExportArgs, context: &Context) -> Result<Vec<(Claims, PathBuf)>> {
     let metadata = args.pcd.as_deref().map(tiles::metadata_file);
     let formats: [(_, _, _, &[&str]); 4] = [
-        ("--mcap", &args.mcap, Some(MCAP), &[]),
-        ("--glb", &args.glb, Some(GLB), &[]),
-        ("--pcd", &metadata, None, &[TILES_FOLDER]),
-        ("--geojson", &args.geojson, Some(GEOJSON), &[]),
+        ("--mcap", args.mcap.as_deref(), Some(MCAP), &[]),
+        ("--glb", args.glb.as_deref(), Some(GLB), &[]),
+        ("--pcd", metadata.as_deref(), None, &[TILES_FOLDER]),
+        ("--geojson", args.geojson.as_deref(), Some(GEOJSON), &[]),
     ];
     let base = refine::base_config(Some(&args.input));
     let map = args.map.as_deref().unwrap_or(&base.map_input.map_file);
@@ -94,7 +94,7 @@ pub fn check(args: &ExportArgs, context: &Context) -> Result<Vec<(Claims, PathBu
     let inputs: Vec<(&str, &Path)> = inputs.into_iter().chain(context.input()).collect();
     let requested = formats
         .into_iter()
-        .filter_map(|(key, path, magic, names)| Some((key, path.as_deref()?, magic, names)));
+        .filter_map(|(key, path, magic, names)| Some((key, path?, magic, names)));
     requested
         .map(|(key, main, magic, names)| {
             let outputs = Outputs {

@@ -15,6 +15,7 @@ use crate::app::run::arguments::setting;
 use crate::app::run::{MachineArgs, Printed, RecordingArgs, gibibytes, input};
 use crate::app::settings;
 use crate::evaluation::RangeMclRules;
+use crate::file_path::FilePath;
 use crate::geometry::Aabb;
 use crate::lidar::Scan;
 use crate::map::MapCache;
@@ -29,7 +30,7 @@ use crate::validation::{InvalidValue, Validate};
 #[derive(Clone, Debug, Args)]
 pub struct InfoArgs {
     /// Recording (its folder, the folder of its scans, or a bag), scan or point cloud (.bin, .pcd, .ply, .npy), map (.ply), or result (.npz).
-    pub path: PathBuf,
+    pub path: FilePath,
 
     /// The recording.
     #[command(flatten)]

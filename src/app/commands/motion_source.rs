@@ -35,7 +35,7 @@ impl MotionSource {
         recording: &Recording,
         rng: &mut impl Rng,
     ) -> Result<(Self, Option<PathBuf>)> {
-        let file = config.odometry_file.clone();
+        let file = config.odometry_file.clone().map(PathBuf::from);
         let motion = match (config.odometry, &file) {
             (OdometrySource::None, _) => Self::Unknown,
             (OdometrySource::File | OdometrySource::Auto, Some(file)) => {

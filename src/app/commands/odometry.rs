@@ -1,7 +1,5 @@
 //! `odometry`: poses of a recording from its scans, with loops closed and all poses adjusted.
 
-use std::path::PathBuf;
-
 use anyhow::{Context as _, Result};
 use clap::Args;
 use serde::Serialize;
@@ -16,6 +14,7 @@ use crate::app::run::{
     Claims, Context, Outputs, Printed, RecordingArgs, RunArgs, input, memory, output,
 };
 use crate::app::settings::OdometryCommandConfig;
+use crate::file_path::FilePath;
 use crate::geometry::Pose3;
 use crate::georeference::{AlignedPath, PathOverTime, align, write_geojson};
 use crate::mapping::{LostPath, check_path, find_poses};
@@ -41,24 +40,24 @@ pub struct OdometryArgs {
 
     /// Folder to write; sets the key `output_folder`.
     #[arg(long = "output", value_name = "FOLDER")]
-    pub output_folder: Option<PathBuf>,
+    pub output_folder: Option<FilePath>,
 
     /// Poses to polish, rows of KITTI or TUM, or a topic of the bag; sets the key `pose_file`.
     #[arg(long = "poses", value_name = "FILE")]
-    pub pose_file: Option<PathBuf>,
+    pub pose_file: Option<FilePath>,
 
     /// Positions of a GNSS receiver that the poses follow: sentences of NMEA, rows of time, latitude, longitude and height, a
     /// folder oxts, or a topic of the bag; sets the key `gnss_file`.
     #[arg(long = "gnss", value_name = "SOURCE")]
-    pub gnss_file: Option<PathBuf>,
+    pub gnss_file: Option<FilePath>,
 
     /// Calibration of the camera whose poses these are; sets the key `calib_file`.
     #[arg(long = "calib", value_name = "FILE")]
-    pub calib_file: Option<PathBuf>,
+    pub calib_file: Option<FilePath>,
 
     /// Inertial sensor that makes the poses level: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
     #[arg(long = "imu", value_name = "FILE")]
-    pub imu_file: Option<PathBuf>,
+    pub imu_file: Option<FilePath>,
 }
 
 /// Finds the poses of the recording that a configuration names; returns what to print.

@@ -19,6 +19,7 @@ use crate::app::settings::{
     self, LocalizationConfig, NPZ, OdometrySource, OutputConfig, RefinementConfig,
 };
 use crate::evaluation::RangeMclRules;
+use crate::file_path::FilePath;
 use crate::files::remove_abandoned;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::localization::State;
@@ -47,11 +48,11 @@ pub struct RefineArgs {
 
     /// Recording; by default that of the localization. Sets the key `scan_folder`.
     #[arg(long = "recording", value_name = "RECORDING")]
-    pub scan_folder: Option<PathBuf>,
+    pub scan_folder: Option<FilePath>,
 
     /// Map; by default that of the localization. Sets the key `map_file`.
     #[arg(long = "map", value_name = "MAP")]
-    pub map_file: Option<PathBuf>,
+    pub map_file: Option<FilePath>,
 
     /// Standard deviations of the poses of a trajectory [m, deg]; sets the key `uncertainty`.
     #[arg(long, value_name = "POSITION,HEADING", value_parser = uncertainty)]
@@ -59,15 +60,15 @@ pub struct RefineArgs {
 
     /// True poses of the recording for the report; sets the key `pose_file`.
     #[arg(long = "truth", value_name = "FILE")]
-    pub pose_file: Option<PathBuf>,
+    pub pose_file: Option<FilePath>,
 
     /// Calibration of the camera whose poses these, and those of a trajectory, are; sets the key `calib_file`.
     #[arg(long = "calib", value_name = "FILE")]
-    pub calib_file: Option<PathBuf>,
+    pub calib_file: Option<FilePath>,
 
     /// Result to write of a trajectory (.npz); sets the key `output_file`.
     #[arg(long = "output", value_name = "RESULT")]
-    pub output_file: Option<PathBuf>,
+    pub output_file: Option<FilePath>,
 }
 
 /// Parses the standard deviations of a position [m] and a heading [deg].

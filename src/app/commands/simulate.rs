@@ -12,7 +12,7 @@
 //! configuration by the same executable.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 
@@ -24,6 +24,7 @@ use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::memory;
 use crate::app::run::{Claims, Context, Interrupt, Printed, Task, output, version};
 use crate::app::settings::to_yaml;
+use crate::file_path::FilePath;
 use crate::files::{claim_folder, remove_abandoned};
 use crate::geometry::{Pose3, distances_m};
 use crate::map::files::ply;
@@ -54,7 +55,7 @@ const REMEDY: &str =
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct SimulationReport {
     /// Folder of the drive.
-    pub folder: PathBuf,
+    pub folder: FilePath,
     /// Number of scans.
     pub frames: usize,
     /// Number of scans that existed before.
@@ -123,7 +124,7 @@ fn write_drive(
             .last()
             .copied()
             .unwrap_or_default(),
-        folder,
+        folder: folder.into(),
     })
 }
 
@@ -152,7 +153,7 @@ fn key(config: &SimulationConfig) -> Result<String> {
     let path = config.path_pose_file.as_deref();
     let path = path.map(|pose_file| recorded_path(pose_file, config.path_calib_file.as_deref()));
     let anywhere = SimulationConfig {
-        output_folder: PathBuf::new(),
+        output_folder: FilePath::default(),
         path_pose_file: None,
         path_calib_file: None,
         ..config.clone()

@@ -2,6 +2,8 @@
 
 use approx::assert_relative_eq;
 
+use std::path::PathBuf;
+
 use super::*;
 use crate::app::run::CLAIMS_FILE;
 use crate::recording::{Recording, velodyne};
@@ -9,7 +11,7 @@ use crate::simulation::{PathSegment, ScannerConfig};
 
 fn small(folder: &Path) -> SimulationConfig {
     SimulationConfig {
-        output_folder: folder.to_owned(),
+        output_folder: folder.into(),
         n_scans: 6,
         path: vec![PathSegment::new(30.0, 20.0, 2.0)],
         scanner: ScannerConfig {
@@ -187,7 +189,7 @@ fn a_drive_that_was_moved_is_kept_and_one_along_another_path_is_not() {
     let calib = folder.path().join("calib.txt");
     fs::write(&calib, "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n").unwrap();
     let here = SimulationConfig {
-        path_pose_file: Some(poses.clone()),
+        path_pose_file: Some(poses.clone().into()),
         path: Vec::new(),
         ..small(&folder.path().join("here"))
     };
@@ -196,8 +198,8 @@ fn a_drive_that_was_moved_is_kept_and_one_along_another_path_is_not() {
     let moved_poses = folder.path().join("moved.txt");
     fs::rename(&poses, &moved_poses).unwrap();
     let there = SimulationConfig {
-        output_folder: folder.path().join("there"),
-        path_pose_file: Some(moved_poses.clone()),
+        output_folder: folder.path().join("there").into(),
+        path_pose_file: Some(moved_poses.clone().into()),
         ..here
     };
     assert_eq!(simulate(&there, Existing::Keep).unwrap().kept, 6);
@@ -241,7 +243,7 @@ fn drives_are_read_back_in_the_documented_frames() {
 fn a_missing_calibration_is_reported_with_its_key() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = small(folder.path());
-    config.path_pose_file = Some(folder.path().join("07.txt"));
+    config.path_pose_file = Some(folder.path().join("07.txt").into());
     let message = format!("{:#}", simulate(&config, Existing::Keep).unwrap_err());
     assert!(message.contains("calib.txt"), "{message}");
     assert!(message.contains("path_calib_file"), "{message}");

@@ -12,6 +12,7 @@ use crate::app::settings::{
     GnssInputConfig, InertialConfig, MapInputConfig, MotionSourceConfig, OdometrySource,
     PoseInputConfig, RecordingConfig,
 };
+use crate::file_path::text_of;
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::odometry::GnssConstraints;
 use crate::recording::{PoseTrack, Recording, RecordingError, is_topic};
@@ -26,7 +27,7 @@ pub fn settings_of(keys: &[(&str, Value)]) -> Vec<(String, String)> {
 
 /// A path as the value of a key.
 pub fn path_value(path: &Path) -> Value {
-    json!(path.to_string_lossy())
+    json!(text_of(path))
 }
 
 /// A recording, and the poses that are given with it.

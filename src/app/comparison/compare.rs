@@ -40,7 +40,7 @@ pub fn run(args: &CompareArgs, form: Form, context: &Context) -> Result<Printed>
     let context = &context.with_config_file(path, ComparisonConfig::PATH);
     let runs = planned_runs(&config)?;
     let layout = Layout {
-        root: config.output_folder.clone(),
+        root: config.output_folder.to_path_buf(),
     };
     let mut executor = Executor::new(&layout, context);
     if args.list_jobs {

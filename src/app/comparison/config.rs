@@ -1,7 +1,6 @@
 //! Configuration of `compare`: sequences × configurations × seeds.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -9,6 +8,7 @@ use smart_default::SmartDefault;
 
 use crate::app::run::arguments::yaml;
 use crate::app::settings::{CommandConfig, require_path};
+use crate::file_path::FilePath;
 use crate::validation::{InvalidValue, Validate, at_least_one, require};
 
 /// Keys of the configuration of a stage with their values, dotted as in `--set`
@@ -23,7 +23,7 @@ pub type Overrides = BTreeMap<String, serde_json::Value>;
 pub struct ComparisonConfig {
     /// Folder of all results.
     #[default("results/comparison".into())]
-    pub output_folder: PathBuf,
+    pub output_folder: FilePath,
     /// Seeds of the runs, one run per seed.
     #[default((1..=5).collect())]
     pub seeds: Vec<u64>,

@@ -161,10 +161,10 @@ impl<'a> Executor<'a> {
         if let Some(refinement) = &run.refinement {
             let start = Instant::now();
             let mut config = RefinementConfig {
-                result_file: result.clone(),
+                result_file: result.clone().into(),
                 ..refinement.clone()
             };
-            config.map_input.map_file = map.folder.join(MAP_FILE);
+            config.map_input.map_file = map.folder.join(MAP_FILE).into();
             config.output.force = true;
             let report = refine::run(&config, self.context).context("while refining")?;
             stages.report = Some(report);
@@ -190,7 +190,7 @@ impl<'a> Executor<'a> {
         artefact::get_or_create(&self.layout.shared("maps"), &keys.map, |folder| {
             let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
             let mut config = BuildMapConfig {
-                mesh_file: folder.join(MAP_FILE),
+                mesh_file: folder.join(MAP_FILE).into(),
                 ..run.build_map.clone()
             };
             config.output.force = true;
@@ -212,11 +212,11 @@ impl<'a> Executor<'a> {
         artefact::get_or_create(&shared, &keys.localization, |folder| {
             let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
             let mut config = LocalizationConfig {
-                result_path: folder.join(RESULT_FILE),
+                result_path: folder.join(RESULT_FILE).into(),
                 save_result: true,
                 ..run.localization.clone()
             };
-            config.map_input.map_file = map.folder.join(MAP_FILE);
+            config.map_input.map_file = map.folder.join(MAP_FILE).into();
             config.output.force = true;
             localize::run(&config, self.context).map(drop)
         })

@@ -90,7 +90,7 @@ impl KeyCache {
                 if let Some(poses) = &drive.path_pose_file {
                     let neighbour = poses.with_file_name("calib.txt");
                     parts.push(self.file(poses)?);
-                    parts.push(self.file(drive.path_calib_file.as_ref().unwrap_or(&neighbour))?);
+                    parts.push(self.file(drive.path_calib_file.as_deref().unwrap_or(&neighbour))?);
                 }
                 Ok(hash_of_texts(&parts))
             }
@@ -259,15 +259,15 @@ mod tests {
 
     fn recording(scan_folder: PathBuf) -> RecordingConfig {
         RecordingConfig {
-            scan_folder,
+            scan_folder: scan_folder.into(),
             ..RecordingConfig::default()
         }
     }
 
     fn true_poses(drive: &Path) -> PoseInputConfig {
         PoseInputConfig {
-            pose_file: Some(drive.join("poses.txt")),
-            calib_file: Some(drive.join("calib.txt")),
+            pose_file: Some(drive.join("poses.txt").into()),
+            calib_file: Some(drive.join("calib.txt").into()),
             ..PoseInputConfig::default()
         }
     }
@@ -299,7 +299,7 @@ mod tests {
                 recording: recording(second.join("velodyne")),
                 given_poses: true_poses(&second),
                 motion: MotionSourceConfig {
-                    odometry_file: Some(second.join("odometry.txt")),
+                    odometry_file: Some(second.join("odometry.txt").into()),
                     ..MotionSourceConfig::default()
                 },
                 ..LocalizationConfig::default()
@@ -355,12 +355,12 @@ mod tests {
         fs::write(path("calib.txt"), "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n").unwrap();
         let mut run = planned_run();
         run.drives.clear();
-        run.build_map.recording.scan_folder = path("velodyne");
-        run.build_map.given_poses.pose_file = Some(path("poses.txt"));
-        run.build_map.given_poses.calib_file = Some(path("calib.txt"));
-        run.localization.recording.scan_folder = path("velodyne");
-        run.localization.given_poses.pose_file = Some(path("poses.txt"));
-        run.localization.given_poses.calib_file = Some(path("calib.txt"));
+        run.build_map.recording.scan_folder = path("velodyne").into();
+        run.build_map.given_poses.pose_file = Some(path("poses.txt").into());
+        run.build_map.given_poses.calib_file = Some(path("calib.txt").into());
+        run.localization.recording.scan_folder = path("velodyne").into();
+        run.localization.given_poses.pose_file = Some(path("poses.txt").into());
+        run.localization.given_poses.calib_file = Some(path("calib.txt").into());
         run.localization.motion.odometry_file = None;
         let before = KeyCache::default().keys(&run).unwrap();
         assert_eq!(KeyCache::default().keys(&run).unwrap(), before);
@@ -377,10 +377,10 @@ mod tests {
         fs::write(&bag, [0; 16]).unwrap();
         let mut run = planned_run();
         run.drives.clear();
-        run.build_map.recording.scan_folder = bag.clone();
+        run.build_map.recording.scan_folder = bag.clone().into();
         run.build_map.given_poses.pose_file = Some("/slam/odometry".into());
         run.build_map.given_poses.calib_file = None;
-        run.localization.recording.scan_folder = bag.clone();
+        run.localization.recording.scan_folder = bag.clone().into();
         run.localization.given_poses.pose_file = None;
         run.localization.given_poses.calib_file = None;
         run.localization.motion.odometry_file = Some("/wheels/odometry".into());
@@ -415,7 +415,7 @@ mod tests {
         fs::write(path("velodyne/000000.bin"), [0; 16]).unwrap();
         let mut run = planned_run();
         run.drives.clear();
-        run.build_map.recording.scan_folder = folder.path().to_owned();
+        run.build_map.recording.scan_folder = folder.path().into();
         run.build_map.given_poses.pose_file = None;
         run.build_map.given_poses.calib_file = None;
         run.localization = LocalizationConfig {
@@ -436,11 +436,11 @@ mod tests {
         let path = folder.path().join("other.txt");
         fs::write(&path, "1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
         let (before, own) = (planned_run(), keys(|_| ()));
-        let other = keys(|run| run.localization.motion.odometry_file = Some(path.clone()));
+        let other = keys(|run| run.localization.motion.odometry_file = Some(path.clone().into()));
         assert!(other.map == own.map && other.localization != own.localization);
         let refined = keys(|run| {
             if let Some(refinement) = &mut run.refinement {
-                refinement.motion.odometry_file = Some(path.clone());
+                refinement.motion.odometry_file = Some(path.clone().into());
             }
         });
         assert!(refined.localization == own.localization && refined.run != own.run);

@@ -79,7 +79,7 @@ fn drives(config: &ComparisonConfig, sequence: &SequenceConfig) -> Result<Vec<Si
     };
     let output_folder = config.output_folder.join("sequences").join(&sequence.name);
     let drive = |drive| SimulationConfig {
-        output_folder: output_folder.clone(),
+        output_folder: output_folder.clone().into(),
         drive,
         ..SimulationConfig::default()
     };
@@ -103,17 +103,17 @@ fn planned_run(
     if let [first, second] = drives {
         let has_errors = first.given_poses.has_errors();
         let [first, second] = [first, second].map(SimulationConfig::drive_folder);
-        build_map.recording.scan_folder = first.join("velodyne");
-        build_map.given_poses.pose_file = Some(first.join("poses.txt"));
-        build_map.given_poses.calib_file = Some(first.join("calib.txt"));
-        localization.recording.scan_folder = second.join("velodyne");
-        localization.given_poses.pose_file = Some(second.join("poses.txt"));
-        localization.given_poses.calib_file = Some(second.join("calib.txt"));
+        build_map.recording.scan_folder = first.join("velodyne").into();
+        build_map.given_poses.pose_file = Some(first.join("poses.txt").into());
+        build_map.given_poses.calib_file = Some(first.join("calib.txt").into());
+        localization.recording.scan_folder = second.join("velodyne").into();
+        localization.given_poses.pose_file = Some(second.join("poses.txt").into());
+        localization.given_poses.calib_file = Some(second.join("calib.txt").into());
         localization.motion.odometry = OdometrySource::File;
-        localization.motion.odometry_file = Some(second.join("odometry.txt"));
+        localization.motion.odometry_file = Some(second.join("odometry.txt").into());
         if has_errors {
-            build_map.given_poses.pose_file = Some(first.join(GIVEN_POSES_FILE));
-            localization.given_poses.pose_file = Some(second.join(POSES_IN_MAP_FILE));
+            build_map.given_poses.pose_file = Some(first.join(GIVEN_POSES_FILE).into());
+            localization.given_poses.pose_file = Some(second.join(POSES_IN_MAP_FILE).into());
         }
     }
     let base = &config.base;
@@ -194,6 +194,7 @@ fn with_overrides<T: Configuration>(config: T, block: &str, overrides: &[&Overri
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::file_path::FilePath;
 
     const TEXT: &str = "\
 output_folder: out
@@ -268,10 +269,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             .refinement
             .clone()
             .unwrap();
-        assert_eq!(
-            refinement.recording.scan_folder,
-            std::path::Path::new("b/velodyne")
-        );
+        assert_eq!(refinement.recording.scan_folder, "b/velodyne".into());
         assert_eq!(refinement.recording.frames.start_idx, 1);
         // The map contains the path of its drive.
         assert_eq!(refinement.map_input.map_pose_file, None);
@@ -307,7 +305,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
         let noises = [0, 1].map(|drive| run.drives[drive].scanner.range_noise_m);
         assert_eq!(noises, [0.02, 0.07]);
         assert!(run.drives.iter().all(|drive| drive.n_scans == 9));
-        let pose_file = |path: &Option<std::path::PathBuf>| path.clone().unwrap();
+        let pose_file = |path: &Option<FilePath>| path.clone().unwrap();
         assert!(
             pose_file(&run.build_map.given_poses.pose_file).ends_with("drive_1/given_poses.txt")
         );

@@ -1,6 +1,6 @@
 //! What `ground` leaves behind: `ground.json`, its table, membership functions, and scans from above.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::Result;
 use schemars::JsonSchema;
@@ -9,13 +9,14 @@ use serde::Serialize;
 use super::plotting::color::SERIES;
 use super::plotting::{GroundPlot, LineChart, Panel, Series};
 use crate::evaluation::{GroundMethodReport, GroundProtocol, LabelledPoints};
+use crate::file_path::FilePath;
 use crate::ground::{Features, FuzzyConfig};
 
 /// The result of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct GroundReport {
     /// Folder of the scans, or the scan.
-    pub scans_from: PathBuf,
+    pub scans_from: FilePath,
     /// Number of scans.
     pub scans: usize,
     /// Number of scans with labels.

@@ -1,7 +1,7 @@
 //! What `build-map` leaves behind next to a map: its report and pictures.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Instant;
 
 use anyhow::Result;
@@ -15,6 +15,7 @@ use super::run_output::MOST_TRIANGLES;
 use crate::app::run::Printed;
 use crate::evaluation::map_quality::ResidualSums;
 use crate::evaluation::{MapQuality, TruthAgreement};
+use crate::file_path::FilePath;
 use crate::geometry::{Pose2, Pose3, distances_m, pose2_from_pose3};
 use crate::map::LocalMapCounts;
 use crate::map::mesh_view::{MeshView, Without, reduced};
@@ -170,7 +171,7 @@ impl BuildReport {
 #[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct ChangesReport {
     /// The older map.
-    pub onto: PathBuf,
+    pub onto: FilePath,
     /// Triangles of the older map that are gone.
     pub gone_triangles: usize,
     /// Their area [m²].
@@ -192,7 +193,7 @@ impl ChangesReport {
         let added_m2: f64 = added.iter().map(|mesh| of_mesh(*mesh)).sum();
         // An empty sum is -0.
         Self {
-            onto: onto.to_owned(),
+            onto: onto.into(),
             gone_triangles: gone.len(),
             gone_m2: 0.0 + gone_m2,
             added_triangles: added.iter().map(|mesh| mesh.triangles()).sum(),

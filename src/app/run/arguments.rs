@@ -2,10 +2,9 @@
 //! field that serializes under the name of that key.
 
 use std::collections::BTreeMap;
-use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use anyhow::{bail, ensure};
+use anyhow::bail;
 use clap::Args;
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -13,13 +12,14 @@ use serde_json::{Value, json};
 use super::context::{Context, MachineArgs};
 use super::visible::visible;
 use crate::app::settings::{self, CommandConfig};
+use crate::file_path::FilePath;
 
 /// Configuration and machine.
 #[derive(Clone, Debug, Args)]
 pub struct ConfigArgs {
     /// Configuration (.yml), or the input: a recording (odometry, build-map, localize), a point cloud (build-map), a result (refine, evaluate) or a trajectory (evaluate). Without it, the command's file under config/ or, if there is none, built-in values.
     #[arg(value_name = "CONFIG | INPUT")]
-    pub config: Option<PathBuf>,
+    pub config: Option<FilePath>,
 
     /// Override a key, such as range_image.width=1024; repeatable.
     #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
@@ -145,19 +145,6 @@ pub fn with_flags<T: CommandConfig>(
 /// A value as YAML that reads back as the same, also where a name has control characters: JSON with escapes for them.
 pub fn yaml(value: &Value) -> String {
     visible(&value.to_string()).into_owned()
-}
-
-/// Requires arguments that outputs can name: reports, JSON and configurations are text in UTF-8.
-pub fn require_text(arguments: &[OsString]) -> anyhow::Result<()> {
-    /// What is no character, in Unicode and YAML.
-    const NONE: [char; 2] = ['\u{fffe}', '\u{ffff}'];
-    for argument in arguments.iter().skip(1) {
-        ensure!(
-            argument.to_str().is_some_and(|text| !text.contains(NONE)),
-            "the argument {argument:?} is not text in UTF-8, which reports, JSON and configurations are written in; rename the file or folder, or give a link to it that has such a name"
-        );
-    }
-    Ok(())
 }
 
 /// Parses finite numbers that are separated by commas.

@@ -53,7 +53,7 @@ pub fn require_file(key: &str, path: &Path) -> Result<()> {
         with_flag(key),
         path.display()
     );
-    let is_default = key == "map_file" && path == MapInputConfig::default().map_file;
+    let is_default = key == "map_file" && path == &*MapInputConfig::default().map_file;
     ensure!(
         !is_default || path.exists(),
         "{} does not exist, where a map is by default (map_file); build one, or give it by --map MAP",

@@ -2,13 +2,14 @@
 
 use std::fs::File;
 use std::io::Read as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use nalgebra::UnitQuaternion;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use crate::file_path::FilePath;
 use crate::geometry::{Pose3, pose_from_degrees};
 use crate::georeference::GnssConfig;
 use crate::recording::{Layout, Selection};
@@ -20,7 +21,7 @@ use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 pub struct RecordingConfig {
     /// The recording: its folder, the folder of its scans, or a bag.
     #[default("data/kitti/velodyne".into())]
-    pub scan_folder: PathBuf,
+    pub scan_folder: FilePath,
     /// Layout of the recording: `kitti`, `kitti_raw`, `kitti360`, `mulran`, `nclt`, `boreas`, `helipr`, `ncd`, `nuscenes`, `apollo`,
     /// `paris_luco`, `generic` (a folder of scans) or `bag`; `None`: as its files show.
     pub layout: Option<Layout>,
@@ -45,9 +46,9 @@ impl Validate for RecordingConfig {
 #[serde(default, deny_unknown_fields)]
 pub struct PoseInputConfig {
     /// Rows of KITTI or TUM, a folder `oxts`, or a topic of a bag; `None`: those that the recording contains, if any.
-    pub pose_file: Option<PathBuf>,
+    pub pose_file: Option<FilePath>,
     /// Calibration of the recording, with its line `Tr`; `None`: the poses in `pose_file` are those of the lidar.
-    pub calib_file: Option<PathBuf>,
+    pub calib_file: Option<FilePath>,
     /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses are given; `None`: they are
     /// those of the lidar.
     pub body_from_lidar: Option<[f64; 6]>,
@@ -91,7 +92,7 @@ impl Validate for PoseInputConfig {
 pub struct InertialConfig {
     /// Its measurements: a table of times, angular rates and forces, a folder `oxts`, or a topic of the bag; `None`: no
     /// sensor.
-    pub imu_file: Option<PathBuf>,
+    pub imu_file: Option<FilePath>,
     /// Roll, pitch, yaw [deg] of its axes in the lidar frame; `None`: from the transforms of the bag or the calibration of
     /// `oxts`, else estimated.
     pub lidar_from_imu: Option<[f64; 3]>,
@@ -121,7 +122,7 @@ impl Validate for InertialConfig {
 pub struct GnssInputConfig {
     /// Sentences of NMEA, rows of time, latitude, longitude and height, a folder `oxts`, or a topic of a bag; `None`: none
     /// are used.
-    pub gnss_file: Option<PathBuf>,
+    pub gnss_file: Option<FilePath>,
     /// Their errors, and the place of the antenna.
     pub errors: GnssConfig,
 }
@@ -139,11 +140,11 @@ impl Validate for GnssInputConfig {
 pub struct MapInputConfig {
     /// Map of `build-map` or range-mcl.
     #[default("results/map.ply".into())]
-    pub map_file: PathBuf,
+    pub map_file: FilePath,
     /// Camera poses of the mapping drive; `None`: the map carries its own frame.
-    pub map_pose_file: Option<PathBuf>,
+    pub map_pose_file: Option<FilePath>,
     /// Calibration of the mapping drive; `None`: the map carries its own frame.
-    pub map_calib_file: Option<PathBuf>,
+    pub map_calib_file: Option<FilePath>,
 }
 
 impl Validate for MapInputConfig {
@@ -161,7 +162,7 @@ pub struct MotionSourceConfig {
     /// Source of the motion.
     pub odometry: OdometrySource,
     /// Odometry poses in KITTI or TUM format, for `odometry: auto` and `file`.
-    pub odometry_file: Option<PathBuf>,
+    pub odometry_file: Option<FilePath>,
 }
 
 impl MotionSourceConfig {

@@ -1,7 +1,5 @@
 //! Configuration of `build-map`: from scans with poses to a triangle mesh.
 
-use std::path::PathBuf;
-
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -10,6 +8,7 @@ use super::blocks::{
     GnssInputConfig, InertialConfig, OutputConfig, PoseInputConfig, RecordingConfig, optional_path,
     require_path,
 };
+use crate::file_path::FilePath;
 use crate::map::{MapConfig, PoseSource};
 use crate::validation::{InvalidValue, Validate, nested, require};
 
@@ -27,16 +26,16 @@ pub struct BuildMapConfig {
     pub gnss: GnssInputConfig,
     /// Output path of the map.
     #[default("results/map.ply".into())]
-    pub mesh_file: PathBuf,
+    pub mesh_file: FilePath,
     /// Map to which the recording is added: it is localized in that map, and what has changed since is replaced.
-    pub onto: Option<PathBuf>,
+    pub onto: Option<FilePath>,
     /// Point cloud in the map frame that is meshed instead of scans with poses, `.pcd`, `.ply` or `.npy`.
-    pub cloud_file: Option<PathBuf>,
+    pub cloud_file: Option<FilePath>,
     /// Every n-th key scan is held out of the map and used to evaluate it; 0 for none.
     pub holdout_step: usize,
     /// Mesh of the true surface in the map frame, for accuracy and completeness; `street.ply` of a
     /// simulated drive is one.
-    pub truth_mesh: Option<PathBuf>,
+    pub truth_mesh: Option<FilePath>,
     /// The build.
     pub map: MapConfig,
     /// Output.

@@ -1,13 +1,12 @@
 //! Configuration of `evaluate`: errors of a result against the ground truth.
 
-use std::path::PathBuf;
-
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{OutputConfig, PoseInputConfig, optional_path, require_path};
 use crate::evaluation::Alignment;
+use crate::file_path::FilePath;
 use crate::recording::{Layout, Selection};
 use crate::validation::{InvalidValue, Validate, at_least_one, nested, positive, require};
 
@@ -19,13 +18,13 @@ use crate::validation::{InvalidValue, Validate, at_least_one, nested, positive, 
 pub struct EvaluationConfig {
     /// Result of `localize`, `refine` or range-mcl, or a trajectory of any origin, rows of KITTI or TUM.
     #[default("results/localization.npz".into())]
-    pub result_file: PathBuf,
+    pub result_file: FilePath,
     /// Calibration of the camera whose poses a trajectory has as rows of KITTI; `None`: they are those of the lidar.
-    pub result_calib_file: Option<PathBuf>,
+    pub result_calib_file: Option<FilePath>,
     /// The ground truth; without any, the poses in `scan_folder`, else those in the result.
     pub given_poses: PoseInputConfig,
     /// The recording whose poses are the ground truth; `None`: for a topic, that of the localization.
-    pub scan_folder: Option<PathBuf>,
+    pub scan_folder: Option<FilePath>,
     /// Layout of the recording; `None`: that of the localization, or as its files show.
     pub layout: Option<Layout>,
     /// Topic of the point clouds in a bag with several, or name of a lidar or scene in a folder with several.
@@ -34,7 +33,7 @@ pub struct EvaluationConfig {
     /// first pose for a trajectory.
     pub alignment: Option<Alignment>,
     /// Folder of the output; `None`: that of a result, and `NAME_evaluation` next to a trajectory `NAME.txt`.
-    pub output_folder: Option<PathBuf>,
+    pub output_folder: Option<FilePath>,
     /// Whether to write the metrics next to the result.
     #[default(true)]
     pub save_evaluation_results: bool,

@@ -1,12 +1,11 @@
 //! Configuration of `ground`: ground segmentation of a recording.
 
-use std::path::PathBuf;
-
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{OutputConfig, RecordingConfig, require_path};
+use crate::file_path::FilePath;
 use crate::ground::GroundConfig;
 use crate::validation::{InvalidValue, Validate, in_range, nested};
 
@@ -18,10 +17,10 @@ pub struct GroundCommandConfig {
     pub recording: RecordingConfig,
     /// Folder of the true classes, `NNNNNN.label`; `None`: `labels` next to the scans, where it
     /// exists.
-    pub label_folder: Option<PathBuf>,
+    pub label_folder: Option<FilePath>,
     /// Folder of the labels, points, pictures and the report.
     #[default("results/ground".into())]
-    pub output_folder: PathBuf,
+    pub output_folder: FilePath,
     /// Confidence above which a point is ground, unitless.
     #[default(0.5)]
     pub ground_threshold: f32,

@@ -1,7 +1,5 @@
 //! Configuration of `localize`: the pose of the car in a map.
 
-use std::path::PathBuf;
-
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -10,6 +8,7 @@ use super::blocks::{
     GnssInputConfig, MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig,
     RecordingConfig, require_path,
 };
+use crate::file_path::FilePath;
 use crate::geometry::FARTHEST_M;
 use crate::localization::TrackerConfig;
 use crate::localization::initialization::StartSpread;
@@ -31,7 +30,7 @@ pub struct LocalizationConfig {
     pub map_input: MapInputConfig,
     /// Output path of the result; all other output is written next to it.
     #[default("results/localization.npz".into())]
-    pub result_path: PathBuf,
+    pub result_path: FilePath,
     /// Whether to write the result.
     #[default(true)]
     pub save_result: bool,

@@ -1,7 +1,5 @@
 //! Configuration of `odometry`: poses of a recording from its scans.
 
-use std::path::PathBuf;
-
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -9,6 +7,7 @@ use smart_default::SmartDefault;
 use super::blocks::{
     GnssInputConfig, InertialConfig, OutputConfig, PoseInputConfig, RecordingConfig, require_path,
 };
+use crate::file_path::FilePath;
 use crate::odometry::TrajectoryConfig;
 use crate::sensor::MotionCompensation;
 use crate::validation::{InvalidValue, Validate, nested, positive};
@@ -27,7 +26,7 @@ pub struct OdometryCommandConfig {
     pub gnss: GnssInputConfig,
     /// Folder of the poses, the report and the picture.
     #[default("results/odometry".into())]
-    pub output_folder: PathBuf,
+    pub output_folder: FilePath,
     /// Largest distance between successive given poses [m]; a larger one is an error of the poses.
     #[default(50.0)]
     pub max_step_m: f64,

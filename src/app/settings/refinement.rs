@@ -1,6 +1,6 @@
 //! Configuration of `refine`: swarm, Gauss-Newton and smoothing of a trajectory.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -11,6 +11,7 @@ use super::blocks::{
     optional_path, require_path,
 };
 use super::localization::LocalizationConfig;
+use crate::file_path::FilePath;
 use crate::refinement::RefinerConfig;
 use crate::sensor::SensorConfig;
 use crate::validation::{InvalidValue, Validate, nested, require};
@@ -28,9 +29,9 @@ pub struct RefinementConfig {
     /// Result of `localize`, to which the refined poses are added, or a trajectory in the frame of the map, rows of TUM
     /// or KITTI.
     #[default("results/localization.npz".into())]
-    pub result_file: PathBuf,
+    pub result_file: FilePath,
     /// Result to write of a trajectory; `None`: `refined.npz` in a folder that is named after it.
-    pub output_file: Option<PathBuf>,
+    pub output_file: Option<FilePath>,
     /// Whether the trajectories also have the poses that are not trusted; comments in those of TUM are the states.
     pub all_poses: bool,
     /// Standard deviations of the poses of a trajectory: position [m] and heading [deg].
@@ -83,14 +84,15 @@ impl RefinementConfig {
     /// The result that is written.
     pub fn output(&self) -> PathBuf {
         if !self.is_trajectory() {
-            return self.result_file.clone();
+            return self.result_file.to_path_buf();
         }
         let next_to_it = || {
             let mut name = self.result_file.file_stem().unwrap_or_default().to_owned();
             name.push("_refined");
             self.result_file.with_file_name(name).join("refined.npz")
         };
-        self.output_file.clone().unwrap_or_else(next_to_it)
+        let named = self.output_file.as_deref().map(Path::to_owned);
+        named.unwrap_or_else(next_to_it)
     }
 }
 

@@ -1,5 +1,5 @@
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::*;
 use crate::rendering::RenderingMethod;
@@ -68,12 +68,12 @@ fn a_written_configuration_loads_to_an_equal_one() {
         let mut config = LocalizationConfig {
             motion: MotionSourceConfig {
                 odometry: OdometrySource::File,
-                odometry_file: Some(PathBuf::from(name)),
+                odometry_file: Some(name.into()),
             },
             initialization: Some(Initialization::Extent),
             ..LocalizationConfig::default()
         };
-        config.map_input.map_file = PathBuf::from(name);
+        config.map_input.map_file = name.into();
         config.tracker.localizer.move_thres_m = 0.1 + 0.2;
         config.tracker.seed = u64::MAX;
         config.tracker.sensor.range_image.fov_up = Some(0.1);

@@ -1,13 +1,13 @@
 //! Figures of a benchmark.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::app::report::Report;
 use crate::app::report::results::length;
+use crate::file_path::FilePath;
 
 /// The file to send back: all figures, what they were measured with, and on what.
 #[derive(Debug, Serialize, JsonSchema)]
@@ -15,9 +15,9 @@ pub struct BenchmarkReport {
     /// Layout of the recordings.
     pub layout: String,
     /// The sequence.
-    pub recording: PathBuf,
+    pub recording: FilePath,
     /// The session that was localized; `null`: every other scan of the sequence.
-    pub second: Option<PathBuf>,
+    pub second: Option<FilePath>,
     /// Name, version and hash of the program.
     pub program: String,
     /// The machine.

@@ -35,6 +35,7 @@ use crate::app::settings::{
     PoseInputConfig, RecordingConfig,
 };
 use crate::configuration::Configuration;
+use crate::file_path::FilePath;
 use crate::recording::Layout;
 
 /// Arguments of `benchmark`.
@@ -46,11 +47,11 @@ pub struct BenchmarkArgs {
 
     /// The sequence.
     #[arg(value_name = "FOLDER")]
-    pub recording: PathBuf,
+    pub recording: FilePath,
 
     /// Another session of the place, which is localized in the map of the first; by default every other scan of the first.
     #[arg(long, value_name = "FOLDER")]
-    pub second: Option<PathBuf>,
+    pub second: Option<FilePath>,
 
     /// Lidar or scene, where the folder has several, or topic of a bag.
     #[arg(long, value_name = "NAME")]
@@ -62,19 +63,19 @@ pub struct BenchmarkArgs {
 
     /// True poses of the sequence; by default those of its layout.
     #[arg(long, value_name = "FILE")]
-    pub truth: Option<PathBuf>,
+    pub truth: Option<FilePath>,
 
     /// True poses of the second session; by default those of its layout.
     #[arg(long, value_name = "FILE")]
-    pub second_truth: Option<PathBuf>,
+    pub second_truth: Option<FilePath>,
 
     /// Calibration of the camera, if true poses that are given are those of a camera.
     #[arg(long = "calib", value_name = "FILE")]
-    pub calibration: Option<PathBuf>,
+    pub calibration: Option<FilePath>,
 
     /// Output folder.
     #[arg(long, value_name = "FOLDER", default_value = "results/benchmark")]
-    pub output: PathBuf,
+    pub output: FilePath,
 
     /// Value of a key of any stage that has it; repeatable.
     #[arg(long = "set", value_name = "KEY=VALUE", value_parser = crate::app::run::arguments::setting)]
@@ -143,11 +144,16 @@ pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
     }
     .prepare()?;
     args.require_known_keys()?;
-    let first = Session::open(args, &args.recording, &args.topic, &args.truth)?;
+    let first = Session::open(args, &args.recording, &args.topic, args.truth.as_deref())?;
     let second = match &args.second {
         Some(folder) => {
             let topic = args.second_topic.clone().or(args.topic.clone());
-            Some(Session::open(args, folder, &topic, &args.second_truth)?)
+            Some(Session::open(
+                args,
+                folder,
+                &topic,
+                args.second_truth.as_deref(),
+            )?)
         }
         None => None,
     };
@@ -204,7 +210,7 @@ impl Benchmark<'_> {
         let config: OdometryCommandConfig = self.configured(session.keys(None, false))?;
         self.stage("odometry", &config, &session.content, |folder| {
             let config = OdometryCommandConfig {
-                output_folder: folder.to_owned(),
+                output_folder: folder.into(),
                 ..config.clone()
             };
             let printed = odometry::run(&config, self.context).context("while finding poses")?;
@@ -243,7 +249,7 @@ impl Benchmark<'_> {
         let config: BuildMapConfig = self.configured(keys)?;
         self.stage("map", &config, &session.content, |folder| {
             let config = BuildMapConfig {
-                mesh_file: folder.join(MAP),
+                mesh_file: folder.join(MAP).into(),
                 ..config.clone()
             };
             let built = build_map::run(&config, self.context);
@@ -259,7 +265,7 @@ impl Benchmark<'_> {
         let config: LocalizationConfig = self.configured(keys)?;
         self.stage("localization", &config, &session.content, |folder| {
             let config = LocalizationConfig {
-                result_path: folder.join(RESULT),
+                result_path: folder.join(RESULT).into(),
                 ..config.clone()
             };
             localize::run(&config, self.context).context("while localizing")?;
@@ -306,10 +312,10 @@ impl Session {
         args: &BenchmarkArgs,
         folder: &Path,
         topic: &Option<String>,
-        truth: &Option<PathBuf>,
+        truth: Option<&Path>,
     ) -> Result<Self> {
         let recording = RecordingConfig {
-            scan_folder: folder.to_owned(),
+            scan_folder: folder.into(),
             layout: args.layout.0,
             topic: topic.clone(),
             ..RecordingConfig::default()
@@ -317,7 +323,10 @@ impl Session {
         let no_poses = PoseInputConfig::default();
         let opened = RecordingInputs::new(&recording, &no_poses).open()?;
         let (truth, calibration) = match truth {
-            Some(truth) => (Some(truth.clone()), args.calibration.clone()),
+            Some(truth) => (
+                Some(truth.to_owned()),
+                args.calibration.clone().map(PathBuf::from),
+            ),
             None => (opened.files.poses.clone(), opened.files.calibration.clone()),
         };
         if truth.is_none() {

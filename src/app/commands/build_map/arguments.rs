@@ -1,11 +1,12 @@
 //! Arguments of `build-map`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clap::Args;
 use serde::Serialize;
 
 use crate::app::run::{RecordingArgs, RunArgs};
+use crate::file_path::FilePath;
 use crate::recording::scan_files;
 
 /// Arguments of `build-map`.
@@ -23,28 +24,28 @@ pub struct BuildMapArgs {
 
     /// Map to write; sets the key `mesh_file`.
     #[arg(long = "output", value_name = "MAP")]
-    pub mesh_file: Option<PathBuf>,
+    pub mesh_file: Option<FilePath>,
 
     /// Poses of the recording, rows of KITTI or TUM, or a topic of the bag; by default those that it contains, else from the scans. Sets the key `pose_file`.
     #[arg(long = "poses", value_name = "FILE")]
-    pub pose_file: Option<PathBuf>,
+    pub pose_file: Option<FilePath>,
 
     /// Calibration of the camera whose poses these are; sets the key `calib_file`.
     #[arg(long = "calib", value_name = "FILE")]
-    pub calib_file: Option<PathBuf>,
+    pub calib_file: Option<FilePath>,
 
     /// Inertial sensor that makes the poses level: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
     #[arg(long = "imu", value_name = "FILE")]
-    pub imu_file: Option<PathBuf>,
+    pub imu_file: Option<FilePath>,
 
     /// Positions of a GNSS receiver, which give the map its place on the Earth: sentences of NMEA, rows of time, latitude,
     /// longitude and height, a folder oxts, or a topic of the bag; sets the key `gnss_file`.
     #[arg(long = "gnss", value_name = "SOURCE")]
-    pub gnss_file: Option<PathBuf>,
+    pub gnss_file: Option<FilePath>,
 
     /// Map to which the recording is added: it is localized there, and what has changed is replaced. Sets the key `onto`.
     #[arg(long, value_name = "MAP")]
-    pub onto: Option<PathBuf>,
+    pub onto: Option<FilePath>,
 
     /// Find the poses, print one independent command per local map that is not finished, and exit.
     #[arg(long, group = "part")]

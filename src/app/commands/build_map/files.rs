@@ -1,11 +1,14 @@
 //! Input and output files of `build-map`.
 
+use std::path::Path;
+
 use anyhow::Result;
 
 use crate::app::commands::stages::RecordingInputs;
 use crate::app::report::map::BuildReport;
 use crate::app::run::{Claims, Context, Outputs, PLY, input, output};
 use crate::app::settings::BuildMapConfig;
+use crate::file_path::text_of;
 use crate::map::MappingPath;
 use crate::map::files::ply;
 use crate::map::mesh_view::MeshView;
@@ -20,7 +23,7 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
     let name = |extension| {
         let path = config.mesh_file.with_extension(extension);
         path.file_name()
-            .map(|name| name.to_string_lossy().into_owned())
+            .map(|name| text_of(Path::new(name)).into_owned())
     };
     let mut inputs = Vec::new();
     if config.cloud_file.is_none() {

@@ -1,6 +1,5 @@
 //! The older map to which a build adds a newer drive.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Result;
@@ -8,13 +7,14 @@ use anyhow::Result;
 use crate::app::run::Context;
 use crate::app::run::artefact::hash::hash_of_file;
 use crate::app::settings::{BuildMapConfig, MapInputConfig};
+use crate::file_path::FilePath;
 use crate::map::mesh_view::MeshView;
 use crate::map::{Map, MapOptions, MappingPath, surface_of};
 
 /// A map that is extended.
 pub struct OlderMap {
     /// Its file.
-    pub file: PathBuf,
+    pub file: FilePath,
     /// Hash of the file.
     pub hash: String,
     /// Its surface.

@@ -1,7 +1,7 @@
 //! The recording of a map, with its poses.
 
 use std::fmt::Write as _;
-use std::path::PathBuf;
+use std::path::Path;
 
 use anyhow::Result;
 
@@ -12,6 +12,7 @@ use super::poses;
 use crate::app::commands::trajectory::poses_next_to;
 use crate::app::run::{Claims, Context, version};
 use crate::app::settings::{self, BuildMapConfig, OutputConfig};
+use crate::file_path::{FilePath, text_of};
 use crate::georeference::AlignedPath;
 use crate::map::build::plan::{self, LocalMapPlan};
 use crate::map::{MapBuilder, MapPlan};
@@ -74,7 +75,7 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     } else if let Some(name) = poses_next_to(&config.mesh_file).file_name()
         && role == Role::Build
     {
-        claims.remove(&[&name.to_string_lossy()])?;
+        claims.remove(&[&text_of(Path::new(name))])?;
     }
     let georeferenced = gnss
         .map(|gnss| georeferenced(&sequence, &gnss))
@@ -133,7 +134,7 @@ fn inputs_of(
     older: Option<&OlderMap>,
 ) -> Result<String> {
     let relevant = BuildMapConfig {
-        mesh_file: PathBuf::new(),
+        mesh_file: FilePath::default(),
         truth_mesh: None,
         output: OutputConfig::default(),
         ..config.clone()

@@ -4,7 +4,7 @@ mod trajectory;
 mod truth;
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Result, ensure};
 use clap::Args;
@@ -16,6 +16,7 @@ use crate::app::run::{Claims, Context, Outputs, RecordingArgs, RunArgs, input, o
 use crate::app::settings::{self, EvaluationConfig, LocalizationConfig};
 use crate::evaluation::alignment::level_camera_axes;
 use crate::evaluation::{Alignment, RangeMclRules};
+use crate::file_path::FilePath;
 use crate::files::folder_of;
 use crate::geometry::TriangleMesh;
 use crate::map::MappingPath;
@@ -38,15 +39,15 @@ pub struct EvaluateArgs {
 
     /// True poses: rows of KITTI or TUM, a folder oxts, or a topic of the recording; by default those in the result. Sets the key `pose_file`.
     #[arg(long = "truth", value_name = "FILE")]
-    pub pose_file: Option<PathBuf>,
+    pub pose_file: Option<FilePath>,
 
     /// Calibration of the camera whose poses the truth has; sets the key `calib_file`.
     #[arg(long = "calib", value_name = "FILE")]
-    pub calib_file: Option<PathBuf>,
+    pub calib_file: Option<FilePath>,
 
     /// Recording whose poses are the truth; sets the key `scan_folder`.
     #[arg(long = "recording", value_name = "RECORDING")]
-    pub scan_folder: Option<PathBuf>,
+    pub scan_folder: Option<FilePath>,
 
     /// Alignment with the truth; by default none for a result in a map, and first for a trajectory. Sets the key `alignment`.
     #[arg(long = "align", value_name = "ALIGNMENT", value_parser = ["none", "first", "rigid"])]
@@ -54,7 +55,7 @@ pub struct EvaluateArgs {
 
     /// Folder of the report; sets the key `output_folder`.
     #[arg(long = "output", value_name = "FOLDER")]
-    pub output_folder: Option<PathBuf>,
+    pub output_folder: Option<FilePath>,
 }
 
 /// Compares a result of `localize`, `refine` or range-mcl, or any trajectory, with the ground truth.
@@ -177,8 +178,9 @@ fn output_files(config: &EvaluationConfig) -> Result<RunFiles> {
         Some(folder) => RunFiles::in_folder(result, folder),
         None if settings::is_result(result) => RunFiles::new(result),
         None => {
-            let stem = result.file_stem().unwrap_or_default().to_string_lossy();
-            let folder = folder_of(result).join(format!("{stem}_evaluation"));
+            let mut name = result.file_stem().unwrap_or_default().to_owned();
+            name.push("_evaluation");
+            let folder = folder_of(result).join(name);
             RunFiles::in_folder(result, &folder)
         }
     })

@@ -29,7 +29,7 @@ pub fn read_track(
         scan_folder: scan_folder
             .or(of_localization)
             .unwrap_or(Path::new(""))
-            .to_owned(),
+            .into(),
         layout: (config.layout).or(localized.and_then(|it| it.recording.layout)),
         topic: topic
             .or(localized.and_then(|it| it.recording.topic.as_ref()))

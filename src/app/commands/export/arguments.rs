@@ -1,35 +1,36 @@
 //! Arguments of `export`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clap::Args;
 
 use crate::app::report::export::MOST_POINTS;
 use crate::app::run::{MachineArgs, gibibytes};
+use crate::file_path::FilePath;
 
 /// Arguments of `export`.
 #[derive(Clone, Debug, Args)]
 #[command(group = clap::ArgGroup::new("format").required(true).multiple(true))]
 pub struct ExportArgs {
     /// Result of `localize` or `refine` (.npz), or a map (.ply, .obj, .stl).
-    pub input: PathBuf,
+    pub input: FilePath,
 
     /// Log to write: poses with covariances, states, particles, scans in the map frame, the map (.mcap).
     #[arg(long, value_name = "FILE", group = "format")]
-    pub mcap: Option<PathBuf>,
+    pub mcap: Option<FilePath>,
 
     /// Model to write: the map, and the path of a result colored by its error (.glb).
     #[arg(long, value_name = "FILE", group = "format")]
-    pub glb: Option<PathBuf>,
+    pub glb: Option<FilePath>,
 
     /// Folder to write the map to as point cloud tiles, for Autoware: `pointcloud_map.pcd/` and
     /// `pointcloud_map_metadata.yaml`.
     #[arg(long, value_name = "FOLDER", group = "format")]
-    pub pcd: Option<PathBuf>,
+    pub pcd: Option<FilePath>,
 
     /// Path on the Earth to write, that of a result or of the mapping drive, where the place of the map is known (.geojson).
     #[arg(long, value_name = "FILE", group = "format")]
-    pub geojson: Option<PathBuf>,
+    pub geojson: Option<FilePath>,
 
     /// Spacing of the points of tiles: one point per square of the surface [m].
     #[arg(long, value_name = "M", requires = "pcd", value_parser = spacing, default_value_t = Self::SPACING_M)]
@@ -41,11 +42,11 @@ pub struct ExportArgs {
 
     /// Recording of the result; by default that of its localization.
     #[arg(long, value_name = "RECORDING")]
-    pub recording: Option<PathBuf>,
+    pub recording: Option<FilePath>,
 
     /// Map of the result; by default that of its localization.
     #[arg(long, value_name = "MAP")]
-    pub map: Option<PathBuf>,
+    pub map: Option<FilePath>,
 
     /// Largest number of points per scan in a log; 0 for a log without scans.
     #[arg(long, value_name = "N", default_value_t = MOST_POINTS)]
@@ -77,15 +78,15 @@ impl ExportArgs {
     /// A log of a result in a map.
     pub fn log_of(result: &Path, map: &Path, log: &Path, force: bool) -> Self {
         Self {
-            input: result.to_owned(),
-            mcap: Some(log.to_owned()),
+            input: result.into(),
+            mcap: Some(log.into()),
             glb: None,
             pcd: None,
             geojson: None,
             spacing: Self::SPACING_M,
             tile_size: Self::TILE_SIZE_M,
             recording: None,
-            map: Some(map.to_owned()),
+            map: Some(map.into()),
             points: MOST_POINTS,
             memory: None,
             force,

@@ -11,6 +11,7 @@ use crate::app::run::input::is_bag;
 use crate::app::run::input::require_folder;
 use crate::app::settings::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
+use crate::file_path::FilePath;
 use crate::recording::velodyne::label_file;
 use crate::recording::{Frame, PointFormat, Recording, ScanSource, scan_files, velodyne};
 
@@ -19,7 +20,7 @@ use crate::recording::{Frame, PointFormat, Recording, ScanSource, scan_files, ve
 pub struct GroundArgs {
     /// Scan (.bin, .pcd, .ply, .npy), recording (its folder, the folder of its scans, or a bag), or configuration
     /// (.yml); by default the configuration's scan_folder.
-    pub input: Option<PathBuf>,
+    pub input: Option<FilePath>,
 
     /// Explain the decision at the point nearest to X Y Z in the lidar frame [m]; needs one scan.
     #[arg(
@@ -37,7 +38,7 @@ pub struct GroundArgs {
 
     /// YAML file; by default config/ground.yml or, without one, built-in values.
     #[arg(long, value_name = "FILE")]
-    pub config: Option<PathBuf>,
+    pub config: Option<FilePath>,
 
     /// Override a key, such as ground_method=pca; repeatable.
     #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
@@ -82,11 +83,11 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
         if !args.simulated {
             require_input(&config, config_path, "scan_folder")?;
         }
-        let folder = config.recording.scan_folder.clone();
+        let folder = config.recording.scan_folder.to_path_buf();
         return Ok((config, folder));
     };
     if path.is_dir() || is_bag(path) {
-        config.recording.scan_folder = path.to_owned();
+        config.recording.scan_folder = path.into();
         return Ok((config, path.to_owned()));
     }
     ensure!(

@@ -135,7 +135,7 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
         task.advance(1);
     }
     let report = GroundReport {
-        scans_from: path.to_owned(),
+        scans_from: path.into(),
         scans: scans.len(),
         labelled_scans,
         points,

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::app::run::output;
 use crate::app::settings::LocalizationConfig;
+use crate::file_path::FilePath;
 use crate::files::folder_of;
 use crate::geometry::{FARTHEST_M, Pose3};
 
@@ -26,7 +27,7 @@ const INTERVAL: Duration = Duration::from_secs(1);
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct LastPose {
     /// The map that it is in.
-    map_file: PathBuf,
+    map_file: FilePath,
     /// Size of the file of the map [bytes].
     map_bytes: u64,
     /// Time of its scan [s].

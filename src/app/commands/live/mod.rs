@@ -7,7 +7,6 @@ mod robot;
 mod ros2;
 
 use std::net::{IpAddr, SocketAddr};
-use std::path::PathBuf;
 
 use anyhow::{Result, bail};
 use clap::Args;
@@ -30,6 +29,7 @@ use crate::app::report::export::{McapFile, Sinks};
 use crate::app::run::arguments::yaml;
 use crate::app::run::{ConfigArgs, Context, RecordingArgs, RunArgs};
 use crate::app::settings::LocalizationConfig;
+use crate::file_path::FilePath;
 use crate::localization::Start;
 
 /// Arguments of `live`.
@@ -48,12 +48,12 @@ pub struct LiveArgs {
 
     /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
     #[arg(long = "map", value_name = "MAP")]
-    pub map_file: Option<PathBuf>,
+    pub map_file: Option<FilePath>,
 
     /// Recording whose scans arrive at their own pace; sets the key `scan_folder`.
     #[arg(long, value_name = "RECORDING", group = "source")]
     #[serde(skip)]
-    pub replay: Option<PathBuf>,
+    pub replay: Option<FilePath>,
 
     /// How many times faster than it was recorded.
     #[arg(long, value_name = "R", default_value_t = 1.0, value_parser = rate, conflicts_with = "topic")]
@@ -78,7 +78,7 @@ pub struct LiveArgs {
     /// Log to write on the way, for Foxglove and rerun (.mcap): map, scans, poses, particles, and states with their reasons.
     #[arg(long, value_name = "FILE")]
     #[serde(skip)]
-    pub record: Option<PathBuf>,
+    pub record: Option<FilePath>,
 
     /// Serve the same to Foxglove and other viewers; by default at 127.0.0.1:8765, which only this machine reaches.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = "127.0.0.1", value_parser = address)]
@@ -147,7 +147,11 @@ impl LiveArgs {
             );
         }
         let mut source = self.run.source.clone();
-        let topic = self.ros2.topic.as_ref().map(PathBuf::from);
+        let topic = self
+            .ros2
+            .topic
+            .as_ref()
+            .map(|topic| FilePath::from(topic.as_str()));
         let scans = self.replay.clone().or(topic);
         match (&source.config, &scans) {
             (Some(_), Some(scans)) => {

@@ -8,7 +8,6 @@ pub mod recorder;
 pub mod tracking;
 mod written;
 
-use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use anyhow::Result;
@@ -25,25 +24,26 @@ use crate::app::report::Report;
 use crate::app::run::arguments::numbers;
 use crate::app::run::{Claims, Context, RecordingArgs, RunArgs};
 use crate::app::settings::LocalizationConfig;
+use crate::file_path::FilePath;
 
 /// Files besides the scans and the map, of `localize` and `live`.
 #[derive(Clone, Debug, Args, Serialize)]
 pub struct DriveArgs {
     /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
     #[arg(long = "odometry", alias = "odom", value_name = "FILE")]
-    pub odometry_file: Option<PathBuf>,
+    pub odometry_file: Option<FilePath>,
 
     /// True poses of the recording for the report; sets the key `pose_file`.
     #[arg(long = "truth", value_name = "FILE")]
-    pub pose_file: Option<PathBuf>,
+    pub pose_file: Option<FilePath>,
 
     /// Calibration of the camera, if the true poses are those of a camera; sets the key `calib_file`.
     #[arg(long = "calib", value_name = "FILE")]
-    pub calib_file: Option<PathBuf>,
+    pub calib_file: Option<FilePath>,
 
     /// Result to write (.npz); sets the key `result_path`.
     #[arg(long = "output", value_name = "RESULT")]
-    pub result_path: Option<PathBuf>,
+    pub result_path: Option<FilePath>,
 }
 
 /// Arguments of `localize`.
@@ -61,7 +61,7 @@ pub struct LocalizeArgs {
 
     /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
     #[arg(long = "map", value_name = "MAP")]
-    pub map_file: Option<PathBuf>,
+    pub map_file: Option<FilePath>,
 
     /// Start in the map [m, deg], if it is known; sets the key `initial_pose`.
     #[arg(long, value_name = "X,Y,HEADING", value_parser = start_pose, allow_hyphen_values = true)]
@@ -71,7 +71,7 @@ pub struct LocalizeArgs {
     /// Positions of a GNSS receiver, a start in a map with a place on the Earth: sentences of NMEA, rows of time, latitude,
     /// longitude and height, a folder oxts, or a topic of the bag; sets the key `gnss_file`.
     #[arg(long = "gnss", value_name = "SOURCE")]
-    pub gnss_file: Option<PathBuf>,
+    pub gnss_file: Option<FilePath>,
 
     /// Odometry, true poses and result.
     #[command(flatten)]
@@ -81,7 +81,7 @@ pub struct LocalizeArgs {
     /// Log to write afterwards, for Foxglove and rerun (.mcap), as `export` does.
     #[arg(long, value_name = "FILE")]
     #[serde(skip)]
-    pub mcap: Option<PathBuf>,
+    pub mcap: Option<FilePath>,
 }
 
 /// Largest number of frames whose trajectories are written, too, while a signal ends the process: that

@@ -13,6 +13,7 @@ use crate::app::report::RunFiles;
 use crate::app::report::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES};
 use crate::app::run::{Claims, Context, Outputs, input};
 use crate::app::settings::{LocalizationConfig, NPZ, OdometrySource};
+use crate::file_path::FilePath;
 use crate::lidar::Scan;
 use crate::map::Map;
 use crate::random::stream;
@@ -64,7 +65,7 @@ pub fn open(
     let mut rng = stream(config.tracker.seed, ODOMETRY_STREAM);
     let (motion, odometry_file) =
         MotionSource::open(&config.motion, &inputs, &recording, &mut rng)?;
-    resolved.motion.odometry_file = odometry_file;
+    resolved.motion.odometry_file = odometry_file.map(FilePath::from);
     let opened = Opened {
         config: resolved,
         files,

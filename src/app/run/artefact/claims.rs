@@ -22,6 +22,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, bail, ensure};
 
 use crate::app::run::output;
+use crate::file_path::{FilePath, text_of};
 use crate::files::{
     Place, claim_folder, folder_of, remove_abandoned, require_no_link, temporary_next_to,
 };
@@ -44,7 +45,7 @@ pub struct Outputs<'a> {
     /// First bytes of a main output that the user names: with `force`, such a file is replaced
     /// whoever wrote it. `None` if its name is ours.
     pub magic: Option<&'static [u8]>,
-    /// Names of the other files and folders.
+    /// Names of the other files and folders, as texts of paths.
     pub names: Vec<String>,
     /// Input files and their keys.
     pub inputs: Vec<(&'a str, &'a Path)>,
@@ -60,7 +61,7 @@ impl Outputs<'_> {
         let mut claims = Claims::read(folder)?;
         self.check_main(&claims)?;
         for name in &self.names {
-            self.check(&folder.join(name), &claims)?;
+            self.check(&folder.join(&*FilePath::of_text(name)), &claims)?;
         }
         let context = || {
             let path = self.magic.map_or(folder, |_| self.main).display();
@@ -231,7 +232,9 @@ impl Claims {
 
     fn paths<'a>(&self, names: &'a [impl AsRef<str>]) -> impl Iterator<Item = PathBuf> + 'a {
         let folder = self.folder.clone();
-        names.iter().map(move |name| folder.join(name.as_ref()))
+        names
+            .iter()
+            .map(move |name| folder.join(&*FilePath::of_text(name.as_ref())))
     }
 
     /// Appends a state of outputs; a claim does not change another state.
@@ -269,7 +272,7 @@ fn append(path: &Path, lines: &str) -> io::Result<()> {
 
 /// The name of an output as in the claims: in one line.
 fn name_of(path: &Path) -> Cow<'_, str> {
-    match path.file_name().unwrap_or_default().to_string_lossy() {
+    match text_of(Path::new(path.file_name().unwrap_or_default())) {
         name if name.contains('\n') => name.replace('\n', "\\n").into(),
         name => name,
     }
