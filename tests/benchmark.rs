@@ -115,7 +115,9 @@ fn scans_and_truths_that_have_changed_are_measured_again() {
     // Another truth of the first session.
     let poses = folder.join("street/drive_1/poses.txt");
     let truth = fs::read_to_string(&poses).unwrap();
-    fs::write(&poses, truth.replacen('1', "0.99", 1)).unwrap();
+    let (rows, last_m) = truth.trim_end().rsplit_once(' ').unwrap();
+    let last_m = last_m.parse::<f64>().unwrap() + 0.01;
+    fs::write(&poses, format!("{rows} {last_m}\n")).unwrap();
     benchmark(folder).succeeds();
     assert_ne!(stages.map(seconds)[0], before[0]);
 }

@@ -21,6 +21,7 @@ use crate::app::report::{LocalizationResults, run_output};
 use crate::app::run::{Claims, Context, Outputs, Printed, input, output};
 use crate::app::settings::{self, RefinementConfig};
 use crate::evaluation::planar_errors;
+use crate::file_path::FilePath;
 use crate::geometry::{Pose3, StampedPose, TriangleMesh, pose2_from_pose3};
 use crate::georeference::write_geojson;
 use crate::map::MappingPath;
@@ -45,7 +46,7 @@ pub struct ExportReport {
 #[derive(Debug, Serialize, JsonSchema)]
 struct WrittenFile {
     /// Path.
-    path: PathBuf,
+    path: FilePath,
     /// Size [MB].
     megabytes: f64,
 }
@@ -63,6 +64,7 @@ pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
     for (mut claims, path) in claims {
         claims.finish(&path)?;
         let megabytes = std::fs::metadata(&path).map_or(0.0, |file| file.len() as f64 / 1e6);
+        let path = path.into();
         files.push(WrittenFile { path, megabytes });
     }
     let row = |it: &WrittenFile| format!("{}, {:.1} MB", it.path.display(), it.megabytes);

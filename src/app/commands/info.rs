@@ -1,7 +1,7 @@
 //! `info`: what a recording, a scan, a map or a result contains, and what is missing for which command.
 
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context as _, Result, bail, ensure};
 use clap::Args;
@@ -136,7 +136,7 @@ pub struct RecordingInfo {
 #[derive(Debug, Serialize, JsonSchema)]
 struct PosesInfo {
     /// Their file, or their topic.
-    path: PathBuf,
+    path: FilePath,
     /// Number of rows.
     rows: usize,
     /// Time of the first row [s]; `None` where rows or scans have no times.
@@ -219,7 +219,7 @@ impl PosesInfo {
     fn new(track: &PoseTrack, has_times: bool) -> Self {
         let times_s = track.times_s.as_deref().filter(|_| has_times);
         Self {
-            path: track.path.clone(),
+            path: track.path.clone().into(),
             rows: track.map_from_lidar.len(),
             first_s: times_s.and_then(|it| it.first()).copied(),
             last_s: times_s.and_then(|it| it.last()).copied(),
@@ -397,7 +397,7 @@ pub struct MapInfo {
 #[derive(Debug, Serialize, JsonSchema)]
 struct CacheInfo {
     /// Their folder.
-    folder: PathBuf,
+    folder: FilePath,
     /// Number of tiles.
     tiles: usize,
     /// Number of files of panoramas.
@@ -417,7 +417,7 @@ impl CacheInfo {
             tiles: count(CacheKind::Tile),
             panoramas: count(CacheKind::Panoramas),
             megabytes: bytes as f64 / 1e6,
-            folder,
+            folder: folder.into(),
         })
     }
 

@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use super::context::{Context, MachineArgs};
 use super::visible::visible;
 use crate::app::settings::{self, CommandConfig};
-use crate::file_path::FilePath;
+use crate::file_path::{FilePath, text_of};
 
 /// Configuration and machine.
 #[derive(Clone, Debug, Args)]
@@ -131,7 +131,7 @@ pub fn with_flags<T: CommandConfig>(
     input_key: &str,
 ) -> anyhow::Result<Vec<(String, String)>> {
     let mut flags: BTreeMap<String, Value> = serde_json::from_value(serde_json::to_value(args)?)?;
-    flags.insert(input_key.to_owned(), json!(source.input()));
+    flags.insert(input_key.to_owned(), json!(source.input().map(text_of)));
     flags.retain(|_, value| !matches!(value, Value::Null | Value::Bool(false)));
     let mut settings = source.settings.clone();
     for (key, value) in flags {

@@ -17,14 +17,14 @@ pub const PUBLISHED: [Published; 4] = [
         data: "SemanticKITTI 00",
         figure: "0.134 m",
         quantity: "localization in a map, average trajectory error",
-        source: "Steinke and Göhring, GroundLoc (2025)",
+        source: "Steinke and Goehring, GroundLoc (RA-L 2025), arXiv 2510.24623",
     },
     Published {
         method: "GroundLoc",
         data: "HeLiPR Roundabout03, across sessions",
         figure: "0.419 m",
         quantity: "localization in the map of another session, average trajectory error",
-        source: "Steinke and Göhring, GroundLoc (2025)",
+        source: "Steinke and Goehring, GroundLoc (RA-L 2025), arXiv 2510.24623",
     },
     Published {
         method: "range-mcl",

@@ -16,6 +16,7 @@ use crate::app::report::export::tiles::{
 };
 use crate::app::run::memory;
 use crate::app::run::{Claims, Context, output};
+use crate::file_path::FilePath;
 use crate::geometry::{TriangleMesh, Vec3, sample_surface, surface_area_m2, surface_samples};
 use crate::map::MappingPath;
 use crate::memory::MemoryError;
@@ -24,7 +25,7 @@ use crate::memory::MemoryError;
 #[derive(Debug, Serialize, JsonSchema)]
 pub struct TilesReport {
     /// Folder of the tiles.
-    folder: PathBuf,
+    folder: FilePath,
     /// Number of tiles.
     tiles: usize,
     /// Number of points.
@@ -80,7 +81,7 @@ pub fn write(
     Ok(Some(TilesReport {
         tiles: tiles.len(),
         points: points.len(),
-        folder: tiles_folder,
+        folder: tiles_folder.into(),
         frame,
     }))
 }
