@@ -75,7 +75,8 @@
 //! |---|---|
 //! | foundations | [`file_path`], `files`, [`geometry`], [`memory`], `random`, `shared_bytes`, `simd`, `statistics`, [`validation`] |
 //! | configurations as texts, with a feature | `configuration` |
-//! | sensor, rays and Earth | [`georeference`], [`inertial`], [`lidar`], `raycasting` |
+//! | inertial sensor | [`inertial`] |
+//! | sensor, rays and Earth | [`georeference`], [`lidar`], `raycasting` |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | motion | [`odometry`] |
 //! | inferred sensor | [`sensor`] |
@@ -112,9 +113,10 @@ pub mod validation;
 // Configurations as texts.
 #[cfg(feature = "configuration")]
 pub mod configuration;
+// Inertial sensor.
+pub mod inertial;
 // Sensor, rays and Earth.
 pub mod georeference;
-pub mod inertial;
 pub mod lidar;
 mod raycasting;
 // Scans, points and meshes.

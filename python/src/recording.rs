@@ -52,6 +52,7 @@ impl Scan {
             times_s: column("times", times, count)?,
             rings: column("rings", rings, count)?,
             time_s: time,
+            gyroscope: None,
         };
         Ok(Self {
             scan,

@@ -89,6 +89,24 @@ pub enum ImuRejection {
     Forces { residual_m_s2: f64, bias_m_s2: f64 },
 }
 
+impl ImuRejection {
+    /// Whether the measurements contradict the scans; else these are too few, or turn too little.
+    pub(crate) fn is_contradiction(&self) -> bool {
+        match self {
+            Self::NoTimes
+            | Self::NotCovered { .. }
+            | Self::TooStill { .. }
+            | Self::AxesUnknown { .. }
+            | Self::TooShort { .. } => false,
+            Self::Saturated
+            | Self::Offset { .. }
+            | Self::Mirrored
+            | Self::Unexplained { .. }
+            | Self::Forces { .. } => true,
+        }
+    }
+}
+
 /// Largest offset between the clocks, and of those that are tried [s].
 const MAX_OFFSET_S: f64 = 0.28;
 const TRIED_S: f64 = 0.3;

@@ -21,11 +21,13 @@ use std::f32::consts::TAU;
 use std::f64::consts::PI;
 
 use glam::Vec3;
+use nalgebra::UnitQuaternion;
 use serde::{Deserialize, Serialize};
 
 use super::scan::Scan;
 use crate::geometry::pose::{exponential, logarithm};
 use crate::geometry::{Pose3, Rigid3f, wrap_angle};
+use crate::inertial::MeasuredRotation;
 
 /// Duration of a revolution, and time between scans, where nothing shows it [s].
 pub const PERIOD_S: f64 = 0.1;
@@ -133,11 +135,12 @@ impl Motion {
         interpolate_motion(&self.previous_from_current, time_s / self.duration_s)
     }
 
-    /// Moves the points of a scan to the moment of its pose. Afterwards the scan has no times; a scan
+    /// Moves the points of a scan to the moment of its pose; its rotation is the measured one where there is one. Afterwards the scan has no times; a scan
     /// without times is unchanged.
     pub fn deskew(&self, scan: &mut Scan) {
         let sweep = Sweep::spanning(scan.times_s.iter().copied());
-        let transforms = sweep.transforms(self);
+        let turns = sweep.turns(scan.measured_rotation().as_ref());
+        let transforms = sweep.transforms(self, turns.as_deref());
         for (point, &time_s) in scan.points.iter_mut().zip(&scan.times_s) {
             *point = transforms[sweep.interval(time_s)].apply(*point);
         }
@@ -149,6 +152,7 @@ impl Motion {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sweep {
     first_s: f32,
+    last_s: f32,
     interval_s: f32,
 }
 
@@ -171,6 +175,7 @@ impl Sweep {
         let interval_s = least_s.log2().ceil().exp2();
         Self {
             first_s: (first_s / interval_s).floor() * interval_s,
+            last_s,
             interval_s,
         }
     }
@@ -181,13 +186,35 @@ impl Sweep {
         (((time_s - self.first_s) / self.interval_s) as usize).min(Self::INTERVALS - 1)
     }
 
-    /// For each interval, the transform of points to the moment of the scan's pose.
-    pub fn transforms(&self, motion: &Motion) -> Vec<Rigid3f> {
+    /// For each interval, the transform of points to the moment of the scan's pose, with measured rotations where there are
+    /// some.
+    pub fn transforms(
+        &self,
+        motion: &Motion,
+        turns: Option<&[UnitQuaternion<f64>]>,
+    ) -> Vec<Rigid3f> {
         let transform = |interval: usize| {
-            let time_s = self.first_s + (interval as f32 + 0.5) * self.interval_s;
-            Rigid3f::from(&motion.after(time_s.into()))
+            let mut moved = motion.after(self.middle_s(interval).into());
+            if let Some(turns) = turns {
+                moved.rotation = turns[interval];
+            }
+            Rigid3f::from(&moved)
         };
         (0..Self::INTERVALS).map(transform).collect()
+    }
+
+    /// For each interval, the measured rotation of points to the moment of the scan's pose; `None` where it was not measured.
+    pub fn turns(&self, rotation: Option<&MeasuredRotation>) -> Option<Vec<UnitQuaternion<f64>>> {
+        // Nothing is measured after the sweep of a last scan, and nothing is needed there.
+        let used = self.interval(self.last_s);
+        let middle_s = |interval: usize| self.middle_s(interval.min(used)).into();
+        let times_s: Vec<f64> = (0..Self::INTERVALS).map(middle_s).collect();
+        rotation?.around(&times_s)
+    }
+
+    /// The middle of an interval [s].
+    fn middle_s(&self, interval: usize) -> f32 {
+        self.first_s + (interval as f32 + 0.5) * self.interval_s
     }
 }
 

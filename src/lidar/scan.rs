@@ -1,8 +1,11 @@
 //! Scans: the points of one sweep.
 
+use std::sync::Arc;
+
 use glam::Vec3;
 
 use super::model::LidarModel;
+use crate::inertial::{Gyroscope, MeasuredRotation};
 
 /// A measured direction and range.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -34,6 +37,8 @@ pub struct Scan {
     pub rings: Vec<u16>,
     /// The moment of the pose [s], from any origin; `None` if unknown.
     pub time_s: Option<f64>,
+    /// The sensor that measured how the lidar turned, on the clock of `time_s`; `None` without one.
+    pub gyroscope: Option<Arc<Gyroscope>>,
 }
 
 impl Scan {
@@ -65,7 +70,16 @@ impl Scan {
             times_s: pick(&self.times_s, n),
             rings: pick(&self.rings, n),
             time_s: self.time_s,
+            gyroscope: self.gyroscope.clone(),
         }
+    }
+
+    /// The measured rotation around its moment, where there is one.
+    pub(crate) fn measured_rotation(&self) -> Option<MeasuredRotation> {
+        Some(MeasuredRotation {
+            gyroscope: self.gyroscope.clone()?,
+            moment_s: self.time_s?,
+        })
     }
 
     /// Adds an angle to the elevations of all points [rad]: corrects beams that are mounted higher than they say.

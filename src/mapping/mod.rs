@@ -26,7 +26,7 @@ pub use trajectory::{InertialSummary, LoopCounts, TrajectorySummary};
 
 pub(crate) use pose_search::PoseSearch;
 pub(crate) use poses::{check_path, checked, key_frames, poses_of, with_given_poses};
-pub(crate) use trajectory::{ADJUSTMENT, find_poses};
+pub(crate) use trajectory::{ADJUSTMENT, calibrate_imu, find_poses};
 
 use crate::map::{BuildError, Map, MapBuilder, MapConfig, MappingPath};
 use crate::odometry::Trajectory;
@@ -90,7 +90,7 @@ pub fn map_recording(
         let search = PoseSearch::new(recording, &sensor, older, &builder.config);
         let found = search.find(builder.options.memory_budget, &builder.on_event)?;
         let rows = search.rows(&found);
-        recording = search.into_recording(rows)?;
+        recording = search.into_recording(rows, found.inertial.is_some())?;
         trajectory = Some(found);
     }
     let recording = recording.compensated_by_poses();

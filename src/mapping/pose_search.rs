@@ -37,6 +37,7 @@ impl<'a> PoseSearch<'a> {
         older: Option<&'a Map>,
         config: &'a MapConfig,
     ) -> Self {
+        let recording = recording.with_gyroscope_of_poses();
         let frames = if recording.track.is_some() {
             recording.frames.clone()
         } else {
@@ -66,7 +67,7 @@ impl<'a> PoseSearch<'a> {
     /// The inertial sensor by which the poses are level; `None` where others show the direction up.
     pub fn imu(&self) -> Option<&Imu> {
         let is_used = self.older.is_none() && !self.is_given();
-        (self.recording.timed_imu()).filter(|_| is_used)
+        (self.recording.imu.as_ref()).filter(|_| is_used)
     }
 
     /// The stage of the build.
@@ -144,14 +145,21 @@ impl<'a> PoseSearch<'a> {
         self.frames.iter().zip(&found.poses).map(row).collect()
     }
 
-    /// The recording with poses in the world of the map, which are checked against each other.
-    pub fn into_recording(self, rows: Vec<StampedPose>) -> Result<Recording, MappingError> {
+    /// The recording with poses in the world of the map, which are checked against each other. It has no inertial sensor where
+    /// one was left out when they were found.
+    pub fn into_recording(
+        self,
+        rows: Vec<StampedPose>,
+        is_level: bool,
+    ) -> Result<Recording, MappingError> {
+        let is_left_out = self.imu().is_some() && !is_level;
         let world_from_map = self.world_from_map();
         let map_from_world = world_from_map.inverse();
         let poses = rows.iter().map(|row| map_from_world * row.map_from_lidar);
         let times_s = rows.iter().map(|row| row.time_s).collect();
         let track = PoseTrack::from_poses(poses.collect(), times_s, world_from_map);
         let mut recording = self.recording;
+        recording.imu = recording.imu.filter(|_| !is_left_out);
         // The rows have the times of the frames, also where these are assumed.
         recording.has_times = true;
         let recording = recording.with_poses(track)?;

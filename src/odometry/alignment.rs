@@ -24,6 +24,10 @@ pub struct Problem<'a> {
     pub observation: Observation<'a>,
     /// Predicted pose.
     pub predicted: Pose3,
+    /// Pose without a translation since the previous scan, turned as was measured, where it was.
+    pub unmoved: Pose3,
+    /// Whether the rotation since the previous scan was measured by a gyroscope.
+    pub is_turn_measured: bool,
     /// Variances of the prediction, (x, y, z, roll, pitch, yaw) in the lidar frame [m², rad²].
     pub prior: Vector6<f64>,
     /// Smallest scale of the robust kernel [m].

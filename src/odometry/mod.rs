@@ -10,7 +10,8 @@
 //! ```
 //!
 //! by Gauss-Newton on SE(3). Surfaces are principal components of the mapped points around q, at the finest scale
-//! at which they are a plane. The prediction is constant velocity. Lengths are shares of the sensor's range.
+//! at which they are a plane. The prediction is constant velocity. Where scans have a calibrated gyroscope, it has measured the
+//! rotation of the prediction, and that within the sweep: the rotation of q(t). Lengths are shares of the sensor's range.
 //!
 //! [`TrajectoryBuilder`] does this for a whole drive and keeps a sample of each scan:
 //!
@@ -36,6 +37,7 @@ mod config;
 mod drive;
 mod elevation_bias;
 mod gnss;
+mod imu_calibrator;
 mod level;
 mod loops;
 mod odometer;
@@ -57,6 +59,7 @@ pub use anchors::{NotInMap, PlacementError};
 pub use config::{LoopConfig, OdometryConfig};
 pub use elevation_bias::ElevationBias;
 pub use gnss::GnssConstraints;
+pub use imu_calibrator::ImuCalibrator;
 pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{MotionDifference, PoseCheck, PoseFit, PoseMeaning};

@@ -155,7 +155,7 @@ fn advance(
     let estimate = OdometryEstimate {
         odom_from_lidar: state.odom_from_lidar,
         previous_from_current: previous.inverse() * state.odom_from_lidar,
-        covariance: Matrix6::from_diagonal(&state.prior(0.0, config)),
+        covariance: Matrix6::from_diagonal(&state.prior(0.0, false, config)),
         state: if state.is_lost() {
             StepState::Lost
         } else {

@@ -6,14 +6,15 @@
 //! wᵢ = (1 + rᵢ²/c²)⁻²                                                     Geman-McClure kernel
 //! ```
 //!
-//! A change of the pose also changes the motion, hence the factor 1 + f. Where the neighbours of a point form no plane,
+//! A change of the pose also changes the motion, hence the factor 1 + f; where a gyroscope has measured the rotation within the
+//! sweep, it does not change that, and the rotation has none. Where the neighbours of a point form no plane,
 //! it has a residual to their mean, with the information σ² (Σ + σ²)⁻¹ of their covariance Σ and the noise σ: all of it
 //! across a thin pole, little along it, little in a bush.
 //!
 //! How well a pose fits is judged without level surfaces: the ground looks the same wherever the sensor is.
 
 use glam::{DMat3, DQuat, DVec3, IVec3};
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{Matrix6, UnitQuaternion, Vector6};
 use rayon::prelude::*;
 
 use super::sampling::TimedPoint;
@@ -39,6 +40,8 @@ pub struct Observation<'a> {
     pub points: &'a [TimedPoint],
     /// Their times.
     pub sweep: Sweep,
+    /// For each interval of the sweep, the measured rotation to the moment of the scan, where there is one.
+    pub turns: Option<&'a [UnitQuaternion<f64>]>,
     /// Pose of the previous scan.
     pub odom_from_previous: Pose3,
     /// Time since then [s].
@@ -116,7 +119,7 @@ impl Observation<'_> {
             rotation,
             lidar_from_odom: rotation.transpose(),
             translation: pose.translation.vector.into(),
-            compensation: self.sweep.transforms(&motion),
+            compensation: self.sweep.transforms(&motion, self.turns),
             kernel: RobustKernel { scale_m: kernel_m },
         };
         let parts: Vec<Equations> = (self.points.par_chunks(CHUNK))
@@ -181,10 +184,12 @@ impl Observation<'_> {
         }
         let weight = at.kernel.weight(distance_m);
         equations.add_cost(at.kernel.cost(distance_m), is_level);
-        let factor = 1.0 + f64::from(point.time_s) / self.duration_s;
+        let moved = 1.0 + f64::from(point.time_s) / self.duration_s;
+        let turned = if self.turns.is_some() { 1.0 } else { moved };
+        let factors = Factors { moved, turned };
         if let Shape::Plane(normal) = surface.shape {
             equations.distances_m.push(distance_m.abs() as f32);
-            let jacobian = factor * jacobian(at.lidar_from_odom * normal, in_lidar);
+            let jacobian = factors.jacobian(at.lidar_from_odom * normal, in_lidar);
             equations.planar.add(&jacobian, distance_m, weight);
             equations.planar.count(distance_m, weight);
             let sector = azimuth_sector(point.position, SECTORS);
@@ -192,7 +197,7 @@ impl Observation<'_> {
         } else {
             let information = at.lidar_from_odom * information * at.rotation;
             let pull = information * (at.lidar_from_odom * offset);
-            let jacobian = DVec3::AXES.map(|axis| factor * jacobian(axis, in_lidar));
+            let jacobian = DVec3::AXES.map(|axis| factors.jacobian(axis, in_lidar));
             let sums = &mut equations.other;
             for row in 0..3 {
                 sums.right_side -= weight * pull[row] * jacobian[row];
@@ -206,10 +211,20 @@ impl Observation<'_> {
     }
 }
 
-/// Derivative of the distance along a normal by translation and rotation of the sensor.
-fn jacobian(normal: DVec3, point: DVec3) -> Vector6<f64> {
-    let turn = point.cross(normal);
-    Vector6::new(normal.x, normal.y, normal.z, turn.x, turn.y, turn.z)
+/// What a change of the pose is multiplied by at the time of a point.
+struct Factors {
+    /// Of its translation.
+    moved: f64,
+    /// Of its rotation.
+    turned: f64,
+}
+
+impl Factors {
+    /// Derivative of the distance along a normal by translation and rotation of the sensor.
+    fn jacobian(&self, normal: DVec3, point: DVec3) -> Vector6<f64> {
+        let (normal, turn) = (self.moved * normal, self.turned * point.cross(normal));
+        Vector6::new(normal.x, normal.y, normal.z, turn.x, turn.y, turn.z)
+    }
 }
 
 impl Sums {
@@ -318,6 +333,7 @@ mod tests {
             map: &map,
             points: &points,
             sweep: Sweep::spanning(std::iter::empty()),
+            turns: None,
             odom_from_previous: Pose3::identity(),
             duration_s: 0.1,
             noise_m: 0.05,

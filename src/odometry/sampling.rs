@@ -2,10 +2,12 @@
 
 use foldhash::HashSet;
 use glam::{DMat3, DQuat, DVec3, Vec3};
+use nalgebra::UnitQuaternion;
 
 use super::config::OdometryConfig;
 use super::voxel_map::pack;
 use crate::geometry::Pose3;
+use crate::inertial::MeasuredRotation;
 use crate::lidar::{Motion, Scan, Sweep};
 
 /// A measured point.
@@ -24,6 +26,8 @@ pub struct Sample {
     pub points: Vec<TimedPoint>,
     /// Their times.
     pub sweep: Sweep,
+    /// The measured rotation around the moment of the scan; `None` without a gyroscope.
+    pub rotation: Option<MeasuredRotation>,
 }
 
 impl Sample {
@@ -32,6 +36,7 @@ impl Sample {
         Self {
             points: vec![],
             sweep: Sweep::spanning(std::iter::empty()),
+            rotation: None,
         }
     }
 
@@ -56,7 +61,11 @@ impl Sample {
             });
         let points = first_per_voxel(valid, config.map_spacing * config.voxel_share * range_m);
         let sweep = Sweep::spanning(points.iter().map(|point| point.time_s));
-        Self { points, sweep }
+        Self {
+            points,
+            sweep,
+            rotation: scan.measured_rotation(),
+        }
     }
 
     /// Points in the frame of a pose, compensated by the motion.
@@ -67,7 +76,8 @@ impl Sample {
             previous_from_current: Pose3::identity(),
             duration_s: 1.0,
         };
-        let compensation = self.sweep.transforms(motion.unwrap_or(&still));
+        let motion = motion.unwrap_or(&still);
+        let compensation = self.sweep.transforms(motion, self.turns().as_deref());
         (self.points.iter())
             .map(|point| {
                 let in_lidar =
@@ -75,6 +85,11 @@ impl Sample {
                 rotation * in_lidar.as_dvec3() + translation
             })
             .collect()
+    }
+
+    /// For each interval of the sweep, the measured rotation of points to the moment of the scan.
+    pub fn turns(&self) -> Option<Vec<UnitQuaternion<f64>>> {
+        self.sweep.turns(self.rotation.as_ref())
     }
 
     /// Points at a larger distance from each other.

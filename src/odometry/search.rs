@@ -7,7 +7,7 @@ use super::alignment::{Alignment, Problem, best};
 use super::residuals::Observation;
 use crate::geometry::Pose3;
 
-/// The alignment with the least cost from starts around the prediction and around the previous pose: shifts along
+/// The alignment with the least cost from starts around the prediction and around the previous pose, turned as was measured, where it was: shifts along
 /// both horizontal axes up to `reach_m`, in steps of `step_m`, and turns about all axes.
 pub fn search(problem: &Problem, step_m: f64, reach_m: f64) -> Option<Alignment> {
     /// Starts that are aligned.
@@ -80,7 +80,7 @@ fn wide_starts(problem: &Problem, step_m: f64, reach_m: f64) -> Vec<Pose3> {
             let shift = Vector3::new(f64::from(x), f64::from(y), 0.0) * step_m;
             (-TURNS..=TURNS).map(move |turn| (shift, Vector3::z() * f64::from(turn) * TURN))
         })
-        .map(|(shift, turn)| problem.observation.odom_from_previous * Pose3::new(shift, turn))
+        .map(|(shift, turn)| problem.unmoved * Pose3::new(shift, turn))
         .collect()
 }
 
@@ -106,7 +106,7 @@ fn starts(problem: &Problem, step_m: f64, reach_m: f64) -> Vec<Pose3> {
     let moves: Vec<Pose3> = (turning.chain(driving))
         .map(|(shift, turn)| Pose3::new(shift, turn))
         .collect();
-    [problem.predicted, problem.observation.odom_from_previous]
+    [problem.predicted, problem.unmoved]
         .iter()
         .flat_map(|middle| moves.iter().map(move |start| middle * start))
         .collect()

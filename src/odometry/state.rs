@@ -1,6 +1,6 @@
 //! OdometerState between scans: the local map, the pose, the motion, and how well it predicts.
 
-use nalgebra::Vector6;
+use nalgebra::{UnitQuaternion, Vector6};
 
 use super::alignment::{Alignment, Problem, best};
 use super::config::OdometryConfig;
@@ -9,6 +9,7 @@ use super::sampling::{Sample, sensor_range};
 use super::search::{search, search_widely};
 use super::voxel_map::VoxelMap;
 use crate::geometry::Pose3;
+use crate::inertial::MeasuredRotation;
 use crate::lidar::{Motion, PERIOD_S, Scan};
 
 /// Step of a search, in voxels.
@@ -82,37 +83,68 @@ impl OdometerState {
         self.first.is_some()
     }
 
-    /// Pose after a time at constant velocity.
-    pub fn predicted(&self, duration_s: f64) -> Pose3 {
-        let motion = (self.motion).map_or(Pose3::identity(), |motion| {
+    /// Pose after a time at constant velocity, turned as was measured, where it was.
+    pub fn predicted(&self, duration_s: f64, turn: Option<UnitQuaternion<f64>>) -> Pose3 {
+        let mut motion = (self.motion).map_or(Pose3::identity(), |motion| {
             motion.after(self.waited_s + duration_s)
         });
+        motion.rotation = turn.unwrap_or(motion.rotation);
         self.mapped * motion
     }
 
-    /// Variances of the prediction, (x, y, z, roll, pitch, yaw) in the lidar frame [m², rad²].
-    pub fn prior(&self, duration_s: f64, config: &OdometryConfig) -> Vector6<f64> {
+    /// The measured rotation since the pose in the local map until a time after the last scan.
+    fn turn(
+        &self,
+        rotation: Option<&MeasuredRotation>,
+        duration_s: f64,
+    ) -> Option<UnitQuaternion<f64>> {
+        rotation?.since(self.waited_s + duration_s)
+    }
+
+    /// Variances of the prediction, (x, y, z, roll, pitch, yaw) in the lidar frame [m², rad²], whose rotation is measured or
+    /// that of constant velocity.
+    pub fn prior(
+        &self,
+        duration_s: f64,
+        is_turn_measured: bool,
+        config: &OdometryConfig,
+    ) -> Vector6<f64> {
         /// Least standard deviation per period, in voxels.
         const FLOOR: f64 = 0.3;
-        /// Least standard deviation per period [rad].
-        const FLOOR_RAD: f64 = 0.02;
         if self.is_lost() {
-            return self.unknown_motion(config);
+            return self.unknown_motion(is_turn_measured, config);
         }
-        let periods = ((self.waited_s + duration_s) / PERIOD_S).max(1.0);
+        let periods = self.periods(duration_s);
         let floor_m = FLOOR * self.voxel_m(config) * periods;
-        let [shift, turn] = self.deviation.map(|square| SIGMAS * SIGMAS * square);
-        let shift = shift + floor_m.powi(2);
-        let turn = turn + (FLOOR_RAD * periods).powi(2);
+        let shift = SIGMAS * SIGMAS * self.deviation[0] + floor_m.powi(2);
+        let turn = self.turn_variance(if is_turn_measured { 1.0 } else { periods });
         Vector6::new(shift, shift, shift, turn, turn, turn)
     }
 
-    /// Variances of a motion that nothing predicts [m², rad²].
-    fn unknown_motion(&self, config: &OdometryConfig) -> Vector6<f64> {
+    /// Variances of a motion of which nothing predicts the translation, nor the rotation unless it is measured [m², rad²].
+    fn unknown_motion(&self, is_turn_measured: bool, config: &OdometryConfig) -> Vector6<f64> {
         /// Standard deviation of the turn [rad].
         const TURN_RAD: f64 = 0.3;
-        let (shift, turn) = (self.reach_m(config).powi(2), TURN_RAD.powi(2));
+        let shift = self.reach_m(config).powi(2);
+        let turn = if is_turn_measured {
+            self.turn_variance(1.0)
+        } else {
+            TURN_RAD.powi(2)
+        };
         Vector6::new(shift, shift, shift, turn, turn, turn)
+    }
+
+    /// Time since the pose in the local map, in periods, at least one.
+    fn periods(&self, duration_s: f64) -> f64 {
+        ((self.waited_s + duration_s) / PERIOD_S).max(1.0)
+    }
+
+    /// Variance of the predicted rotation over some periods [rad²]. That of a measured one is that of one period: its error
+    /// does not grow as that of an assumed rate does.
+    fn turn_variance(&self, periods: f64) -> f64 {
+        /// Least standard deviation per period [rad].
+        const FLOOR_RAD: f64 = 0.02;
+        SIGMAS * SIGMAS * self.deviation[1] + (FLOOR_RAD * periods).powi(2)
     }
 
     /// Registers a scan to the local map and adds it; `None` if it does not fit, then the pose is unchanged.
@@ -127,17 +159,22 @@ impl OdometerState {
         let sparse = sample.thinned(config.registration_spacing * self.voxel_m(config));
         let min_kernel_m = config.min_kernel * self.voxel_m(config);
         let since_s = self.waited_s + duration_s;
+        let turn = self.turn(sample.rotation.as_ref(), duration_s);
+        let turns = sample.turns();
         let problem = Problem {
             observation: Observation {
                 map: &self.map,
                 points: &sparse,
                 sweep: sample.sweep,
+                turns: turns.as_deref(),
                 odom_from_previous: self.mapped,
                 duration_s: since_s,
                 noise_m: min_kernel_m,
             },
-            predicted: self.predicted(duration_s),
-            prior: self.prior(duration_s, config),
+            predicted: self.predicted(duration_s, turn),
+            unmoved: turn.map_or(self.mapped, |turn| self.mapped * turn),
+            is_turn_measured: turn.is_some(),
+            prior: self.prior(duration_s, turn.is_some(), config),
             min_kernel_m,
             iterations: config.iterations,
         };
@@ -203,7 +240,7 @@ impl OdometerState {
         }
         let from = found.as_ref().map(|found| found.odom_from_lidar);
         let unpredicted = Problem {
-            prior: self.unknown_motion(config),
+            prior: self.unknown_motion(problem.is_turn_measured, config),
             ..*problem
         };
         let searched = search_widely(&unpredicted, from, STEP * voxel_m, self.reach_m(config));
@@ -226,7 +263,7 @@ impl OdometerState {
         let (step_m, reach_m) = (STEP * self.voxel_m(config), self.reach_m(config));
         let compensated =
             |found: Option<Alignment>| self.with_first_compensated(first, problem, &found?, config);
-        let still = problem.align(&self.mapped, self.voxel_m(config));
+        let still = problem.align(&problem.unmoved, self.voxel_m(config));
         let near = search(problem, step_m, reach_m);
         let found = best([still, near].into_iter().filter_map(compensated));
         if found.as_ref().is_some_and(|found| self.fits(found, config)) {
@@ -355,7 +392,8 @@ impl OdometerState {
 
     /// Moves by the prediction. After several scans in turn that do not fit, the local map restarts with this one.
     pub fn coast(&mut self, scan: &Scan, duration_s: f64, config: &OdometryConfig) {
-        self.odom_from_lidar = self.predicted(duration_s);
+        let turn = self.turn(scan.measured_rotation().as_ref(), duration_s);
+        self.odom_from_lidar = self.predicted(duration_s, turn);
         self.waited_s += duration_s;
         self.missed += 1;
         if (self.is_lost() || self.missed >= config.restart_after) && sensor_range(scan).is_some() {
@@ -467,7 +505,7 @@ mod tests {
     fn a_motion_is_possible_within_the_largest_acceleration() {
         let state = moving();
         let is_smooth = |off: Pose3, since_s: f64| {
-            let predicted = state.predicted(since_s);
+            let predicted = state.predicted(since_s, None);
             let found = Alignment {
                 odom_from_lidar: predicted * off,
                 ..found(0.3, 0.9, 0.9)
@@ -539,10 +577,10 @@ mod tests {
     fn the_prediction_and_its_standard_deviations_are_proportional_to_the_time() {
         let state = moving();
         for periods in [1.0, 2.0, 5.0] {
-            let predicted = state.predicted(periods * PERIOD_S);
+            let predicted = state.predicted(periods * PERIOD_S, None);
             assert_relative_eq!(predicted.translation.x, periods, epsilon = 1e-9);
             // Without deviations so far: 0.3 voxels of 0.5 m, and 0.02 rad per period.
-            let prior = state.prior(periods * PERIOD_S, &config()).map(f64::sqrt);
+            let prior = state.prior(periods * PERIOD_S, false, &config()).map(f64::sqrt);
             assert_relative_eq!(prior.x, 0.15 * periods, epsilon = 1e-12);
             assert_relative_eq!(prior[5], 0.02 * periods, epsilon = 1e-12);
         }

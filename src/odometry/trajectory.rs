@@ -10,6 +10,7 @@ use super::anchors::{self, NotInMap, Placed, PlacementError};
 use super::config::{LoopConfig, OdometryConfig};
 use super::drive::{Drive, POINT_BYTES, SHORTER, Submap};
 use super::gnss::{self, GnssConstraints};
+use super::imu_calibrator::measured_turn;
 use super::level::{Levelled, level};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
 use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
@@ -318,17 +319,8 @@ fn make_level(
         .iter()
         .map(|time_s| first_s + time_s)
         .collect();
-    let is_known = |row: &usize| {
-        let step = &odometry[*row];
-        step.state == StepState::Registered && step.degenerate_directions.is_empty()
-    };
     let turns: Vec<MeasuredTurn> = (1..times_s.len())
-        .filter(is_known)
-        .map(|row| MeasuredTurn {
-            from_s: times_s[row - 1],
-            to_s: times_s[row],
-            turn: odometry[row].previous_from_current.rotation,
-        })
+        .filter_map(|row| measured_turn(&odometry[row], (times_s[row - 1], times_s[row])))
         .collect();
     let calibration = ImuCalibration::estimate(imu, &turns)?;
     let Levelled {

@@ -9,6 +9,7 @@ use super::bags::Bag;
 use super::error::RecordingError;
 use super::scan_files::{self, PointFormat};
 use crate::geometry::{Pose3, StampedPose};
+use crate::inertial::Gyroscope;
 use crate::lidar::{Motion, PointTiming, Scan};
 
 /// Where a scan is stored.
@@ -82,6 +83,8 @@ pub struct Frame {
     pub elevation_bias_rad: f64,
     /// Motion by which the scan is deskewed when it is read; `None` if it is not.
     pub motion: Option<Motion>,
+    /// The sensor that has measured rotations between and within the scans; `None` without one.
+    pub gyroscope: Option<Arc<Gyroscope>>,
 }
 
 impl Frame {
@@ -96,6 +99,7 @@ impl Frame {
             is_timed: true,
             elevation_bias_rad: 0.0,
             motion: None,
+            gyroscope: None,
         }
     }
 
@@ -116,6 +120,7 @@ impl Frame {
         if !self.is_timed {
             scan.times_s.clear();
         }
+        scan.gyroscope = scan.gyroscope.or_else(|| self.gyroscope.clone());
         if let Some(motion) = &self.motion {
             motion.deskew(&mut scan);
         }

@@ -24,7 +24,10 @@ use super::open::Recording;
 use super::open::is_topic;
 use super::oxts;
 use super::table::{parse_numbers, read_rows, read_text};
-use crate::inertial::{GRAVITY_M_S2, Imu, ImuSample, ImuSamples};
+use crate::geometry::Pose3;
+use crate::inertial::{
+    GRAVITY_M_S2, Gyroscope, Imu, ImuCalibration, ImuSample, ImuSamples, MeasuredTurn,
+};
 use crate::statistics::median;
 
 impl Recording {
@@ -73,24 +76,58 @@ impl Recording {
         Ok((read_table(source)?, None))
     }
 
-    /// The same recording with an inertial sensor, by which poses that are found from the scans are level.
+    /// The same recording with an inertial sensor, whose rates predict the rotations between and within the scans, and by which
+    /// poses that are found from the scans are level.
     #[must_use]
     pub fn with_imu(self, imu: Imu) -> Self {
-        Self {
-            imu: Some(imu),
-            ..self
-        }
-    }
-
-    /// The inertial sensor, unless the times of the scans are assumed.
-    pub(crate) fn timed_imu(&self) -> Option<&Imu> {
-        let imu = self.imu.as_ref()?;
         if !self.has_times {
             tracing::warn!(
                 "the inertial sensor is left out: the scans have no times; give them in times.txt"
             );
         }
-        Some(imu).filter(|_| self.has_times)
+        Self {
+            imu: Some(imu).filter(|_| self.has_times),
+            ..self
+        }
+    }
+
+    /// The same recording with a calibrated gyroscope: its scans have the rotations that it has measured.
+    #[must_use]
+    pub fn with_gyroscope(mut self, gyroscope: Gyroscope) -> Self {
+        let gyroscope = Arc::new(gyroscope);
+        for frame in self.frames.iter_mut().chain(&mut self.skipped) {
+            frame.gyroscope = Some(gyroscope.clone());
+        }
+        self
+    }
+
+    /// The same recording, whose inertial sensor is calibrated by the poses of the recording, or left out with a warning where
+    /// it contradicts them.
+    #[must_use]
+    pub(crate) fn with_gyroscope_of_poses(mut self) -> Self {
+        let (Some(imu), Some(track)) = (&self.imu, &self.track) else {
+            return self;
+        };
+        let poses: Vec<(f64, Pose3)> = (self.dense_frames().iter())
+            .filter_map(|frame| Some((frame.time_s, track.pose_at(frame, self.has_times)?)))
+            .collect();
+        let turn = |pair: &[(f64, Pose3)]| MeasuredTurn {
+            from_s: pair[0].0,
+            to_s: pair[1].0,
+            turn: pair[0].1.rotation.inverse() * pair[1].1.rotation,
+        };
+        let turns: Vec<MeasuredTurn> = poses.windows(2).map(turn).collect();
+        match ImuCalibration::estimate(imu, &turns) {
+            Ok(calibration) => {
+                let gyroscope = Gyroscope::new(imu, calibration);
+                self.with_gyroscope(gyroscope)
+            }
+            Err(rejection) => {
+                tracing::warn!("the inertial sensor is left out: {rejection}");
+                self.imu = None;
+                self
+            }
+        }
     }
 }
 

@@ -67,7 +67,7 @@ pub struct Recording {
     pub track: Option<PoseTrack>,
     /// Pose of the lidar on the body whose poses a bag has; `None`: that of its static transforms.
     pub body_from_lidar: Option<Pose3>,
-    /// The inertial sensor, by which poses that are found from the scans are level.
+    /// The inertial sensor, whose axes and clock need not be known.
     pub imu: Option<Imu>,
     /// The bag and the topic of its scans.
     #[cfg(feature = "bags")]
@@ -394,15 +394,16 @@ impl Recording {
         self
     }
 
-    /// The same recording, whose scans are deskewed by its poses.
+    /// The same recording, whose scans are deskewed by its poses, with the rotations of its inertial sensor where it has one.
     #[must_use]
-    pub fn compensated_by_poses(mut self) -> Self {
-        if let Some(track) = &self.track {
-            for frame in &mut self.frames {
-                frame.motion = track.motion_at(frame, self.has_times);
+    pub fn compensated_by_poses(self) -> Self {
+        let mut recorded = self.with_gyroscope_of_poses();
+        if let Some(track) = &recorded.track {
+            for frame in &mut recorded.frames {
+                frame.motion = track.motion_at(frame, recorded.has_times);
             }
         }
-        self
+        recorded
     }
 
     /// The frame of the poses in the world of their file, and the calibration; identities without poses.

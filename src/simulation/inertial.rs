@@ -52,11 +52,13 @@ impl Validate for SimulatedImuConfig {
 pub enum ImuGrade {
     /// None.
     Exact,
-    /// A sensor of phones and drones, Bosch BMI088 (data sheet BST-BMI088-DS001): 0.014 deg/s/√Hz, offset 1 deg/s, 2 deg/h;
-    /// 175 µg/√Hz, offset 20 mg, 0.2 mg per degree of temperature.
+    /// A sensor of phones and drones, after Bosch BMI088 (data sheet BST-BMI088-DS001, section 1): noise of rates 0.014
+    /// deg/s/√Hz, offset 1 deg/s, bias stability 2 deg/h; noise of forces 160 to 190 µg/√Hz by axis, here 175, offset 20 mg, and
+    /// 0.2 mg per kelvin, of which it is assumed to drift by one.
     Consumer,
-    /// A calibrated sensor of the class of Analog Devices' ADIS16470, rounded: 0.008 deg/s/√Hz, offset 0.2 deg/s, 8 deg/h;
-    /// 100 µg/√Hz, offset 3 mg, 0.02 mg.
+    /// A calibrated sensor for vehicles, after Analog Devices' ADIS16470 (data sheet, revision C, features): noise of rates 0.008
+    /// deg/s/√Hz, bias stability 8 deg/h and 13 µg, here 20 µg. Assumed: offsets of 0.2 deg/s and 3 mg, and a noise of forces of
+    /// 100 µg/√Hz.
     Automotive,
 }
 

@@ -55,7 +55,7 @@ pub struct OdometryArgs {
     #[arg(long = "calib", value_name = "FILE")]
     pub calib_file: Option<FilePath>,
 
-    /// Inertial sensor that makes the poses level: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
+    /// Inertial sensor whose rates predict rotations and compensate scans, and whose forces make poses level that are found from the scans: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
     #[arg(long = "imu", value_name = "FILE")]
     pub imu_file: Option<FilePath>,
 }
@@ -69,8 +69,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     let gnss = config.gnss.read(&recording)?;
     let frames = recording.dense_frames();
     let is_given = recording.track.is_some();
-    config.inertial.warn_unless(!is_given);
-    let imu = recording.timed_imu().filter(|_| !is_given);
+    let imu = recording.imu.as_ref().filter(|_| !is_given);
     let name = if is_given { "polish" } else { "odometry" };
     let found = trajectory::find(name, frames.len(), context, |on_event| {
         find_poses(
@@ -170,7 +169,7 @@ fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Sensor)> {
     let mut recording = config.inertial.open(inputs.open()?)?;
     if let Some(path) = &config.given_poses.pose_file {
         let track = inputs.track(path, &recording)?;
-        recording = recording.with_poses(track)?;
+        recording = recording.with_poses(track)?.with_gyroscope_of_poses();
         check_path(&recording, config.max_step_m)
             .with_context(|| format!("pose_file is {}", path.display()))?;
         recording.skipped.clear();

@@ -66,6 +66,10 @@ pub struct RefineArgs {
     #[arg(long = "calib", value_name = "FILE")]
     pub calib_file: Option<FilePath>,
 
+    /// Inertial sensor whose rates compensate scans: a table of times, rates and forces, a folder oxts, or a topic of the bag; by default that of the localization. Sets the key `imu_file`.
+    #[arg(long = "imu", value_name = "FILE")]
+    pub imu_file: Option<PathBuf>,
+
     /// Result to write of a trajectory (.npz); sets the key `output_file`.
     #[arg(long = "output", value_name = "RESULT")]
     pub output_file: Option<FilePath>,
@@ -104,6 +108,8 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let map = config.map_input.load(MapOptions::default(), context)?;
     let mut resolved = config.clone();
     let (sequence, sensor) = inputs.open_in_map(&map, &mut resolved.sensor)?;
+    let odometry = OdometryConfig::default();
+    let sequence = (config.inertial).open_calibrated(sequence, &odometry, context)?;
     let config = &resolved;
     if is_trajectory {
         results = follow(config, &map, &sequence)?;
@@ -191,6 +197,9 @@ fn prepare(
         config.result_file.display()
     );
     let mut inputs = input_files(inputs, &config.map_input, &config.motion, context)?;
+    let measurements = config.inertial.files(&config.recording);
+    input::require(measurements.as_slice())?;
+    inputs.extend(measurements);
     inputs.extend(is_trajectory.then_some(("result_file", config.result_file.as_path())));
     let outputs = Outputs {
         key,

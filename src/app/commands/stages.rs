@@ -14,7 +14,8 @@ use crate::app::settings::{
 };
 use crate::file_path::text_of;
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
-use crate::odometry::GnssConstraints;
+use crate::mapping::calibrate_imu;
+use crate::odometry::{GnssConstraints, OdometryConfig};
 use crate::recording::{PoseTrack, Recording, RecordingError, is_topic};
 use crate::sensor::{Sensor, SensorConfig};
 
@@ -98,15 +99,6 @@ impl InertialConfig {
         Some(("imu_file", recording.file(self.imu_file.as_deref()?)?))
     }
 
-    /// Warns where a sensor is named that poses of another origin leave without use.
-    pub fn warn_unless(&self, is_used: bool) {
-        if self.imu_file.is_some() && !is_used {
-            tracing::warn!(
-                "the inertial sensor is not used: it makes poses level that are found from the scans alone"
-            );
-        }
-    }
-
     /// The recording with its inertial sensor, where one is named.
     pub fn open(&self, recording: Recording) -> Result<Recording> {
         let Some(path) = &self.imu_file else {
@@ -114,6 +106,30 @@ impl InertialConfig {
         };
         let imu = recording.read_imu(path, self.lidar_from_imu())?;
         Ok(recording.with_imu(imu))
+    }
+
+    /// The recording with the rotations of its inertial sensor, where one is named, which is calibrated by the odometry of the
+    /// first scans, or left out with a warning where it contradicts them.
+    pub fn open_calibrated(
+        &self,
+        recording: Recording,
+        odometry: &OdometryConfig,
+        context: &Context,
+    ) -> Result<Recording> {
+        let recording = self.open(recording)?;
+        let Some(imu) = &recording.imu else {
+            return Ok(recording);
+        };
+        let interrupt = &context.interrupt;
+        let frames = recording.dense_frames();
+        let calibrated = calibrate_imu(&frames, imu, odometry, &|_| interrupt.flow());
+        match calibrated.map_err(|error| interrupt.explain(error))? {
+            Ok(gyroscope) => Ok(recording.with_gyroscope(gyroscope)),
+            Err(rejection) => {
+                tracing::warn!("the inertial sensor is left out: {rejection}");
+                Ok(recording)
+            }
+        }
     }
 }
 

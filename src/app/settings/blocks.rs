@@ -86,7 +86,7 @@ impl Validate for PoseInputConfig {
     }
 }
 
-/// The inertial sensor of a recording, by which poses that are found from the scans are level.
+/// The inertial sensor of a recording.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct InertialConfig {

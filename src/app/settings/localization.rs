@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{
-    GnssInputConfig, MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig,
+    GnssInputConfig, InertialConfig, MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig,
     RecordingConfig, require_path,
 };
 use crate::file_path::FilePath;
@@ -43,6 +43,8 @@ pub struct LocalizationConfig {
     pub pose_tracking: Option<bool>,
     /// Start: x, y in the map [m], heading [deg].
     pub initial_pose: Option<[f64; 3]>,
+    /// Its inertial sensor, where it is used: its rates predict rotations in the odometry of the scans, and compensate them.
+    pub inertial: InertialConfig,
     /// Positions of a GNSS receiver, of which the first is a start in a map with a place on the Earth where `initial_pose` is
     /// not given: around it in every heading.
     pub gnss: GnssInputConfig,
@@ -133,6 +135,7 @@ impl Validate for LocalizationConfig {
         nested("recording", &self.recording)?;
         nested("given_poses", &self.given_poses)?;
         nested("map_input", &self.map_input)?;
+        nested("inertial", &self.inertial)?;
         nested("gnss", &self.gnss)?;
         require_path("result_path", &self.result_path)?;
         self.motion.validate(&self.given_poses)?;

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{
-    MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig, RecordingConfig, is_result,
-    optional_path, require_path,
+    InertialConfig, MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig,
+    RecordingConfig, is_result, optional_path, require_path,
 };
 use super::localization::LocalizationConfig;
 use crate::file_path::FilePath;
@@ -37,6 +37,8 @@ pub struct RefinementConfig {
     /// Standard deviations of the poses of a trajectory: position [m] and heading [deg].
     #[default([1.0, 10.0])]
     pub uncertainty: [f64; 2],
+    /// Its inertial sensor, where it is used: its rates compensate the scans.
+    pub inertial: InertialConfig,
     /// Motion between frames, for smoothing.
     pub motion: MotionSourceConfig,
     /// What is known about the sensor; the rest is inferred from the scans.
@@ -60,6 +62,7 @@ impl RefinementConfig {
             map_input: localization.map_input,
             result_file: localization.result_path,
             all_poses: localization.all_poses,
+            inertial: localization.inertial,
             motion: localization.motion,
             sensor: tracker.sensor,
             refiner: RefinerConfig {
@@ -101,6 +104,7 @@ impl Validate for RefinementConfig {
         nested("recording", &self.recording)?;
         nested("given_poses", &self.given_poses)?;
         nested("map_input", &self.map_input)?;
+        nested("inertial", &self.inertial)?;
         require_path("result_file", &self.result_file)?;
         optional_path("output_file", self.output_file.as_deref())?;
         let [position_m, heading_deg] = self.uncertainty;

@@ -34,7 +34,7 @@ pub struct BuildMapArgs {
     #[arg(long = "calib", value_name = "FILE")]
     pub calib_file: Option<FilePath>,
 
-    /// Inertial sensor that makes the poses level: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
+    /// Inertial sensor whose rates predict rotations and compensate scans, and whose forces make poses level that are found from the scans: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
     #[arg(long = "imu", value_name = "FILE")]
     pub imu_file: Option<FilePath>,
 

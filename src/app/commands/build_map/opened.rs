@@ -57,8 +57,6 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let (mut sequence, sensor) = poses::check(recording, &mut config)?;
     let gnss = config.gnss.read(&sequence)?;
     let mut trajectory = None;
-    let is_level = sequence.track.is_none() && older.is_none();
-    config.inertial.warn_unless(is_level);
     if PoseSearch::is_needed(&sequence, &config.map) {
         let has_times = sequence.has_times;
         let search = PoseSearch::new(sequence, &sensor, older_map.as_ref(), &config.map);
@@ -143,6 +141,9 @@ fn inputs_of(
     text += &settings::to_yaml(&relevant)?;
     if let Some(older) = older {
         writeln!(text, "onto {}", older.hash)?;
+    }
+    if let Some(gyroscope) = frames.first().and_then(|frame| frame.gyroscope.as_ref()) {
+        writeln!(text, "{gyroscope:?}")?;
     }
     for frame in frames {
         let path = &frame.source;

@@ -104,7 +104,7 @@ pub fn find(
         "the poses are kept in {}; run the same command again to continue",
         path.display()
     ));
-    let recording = search.into_recording(rows);
+    let recording = search.into_recording(rows, summary.inertial.is_some());
     let origin = || format!("the poses from the scans are in {}", path.display());
     Ok((recording.with_context(origin)?, summary))
 }

@@ -56,12 +56,16 @@ pub fn open(
     let mut read = input_files(inputs, &config.map_input, &config.motion, context)?;
     let fixes = config.gnss.file(&config.recording);
     input::require(fixes.as_slice())?;
-    read.extend(fixes);
+    let measurements = config.inertial.files(&config.recording);
+    input::require(measurements.as_slice())?;
+    read.extend(fixes.into_iter().chain(measurements));
     let claims = prepare(config, read, further_files, &files)?;
     let map = config.map_input.load(config.map_options(), context)?;
     let mut resolved = config.clone();
     let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
     gnss_start::resolve(&mut resolved, &map, &recording)?;
+    let odometry = config.tracker.odometry.clone().unwrap_or_default();
+    let recording = (config.inertial).open_calibrated(recording, &odometry, context)?;
     let mut rng = stream(config.tracker.seed, ODOMETRY_STREAM);
     let (motion, odometry_file) =
         MotionSource::open(&config.motion, &inputs, &recording, &mut rng)?;

@@ -130,6 +130,8 @@ impl ScanOutline {
             times_s: (chosen.iter())
                 .filter_map(|&k| scan.times_s.get(k).copied())
                 .collect(),
+            time_s: scan.time_s,
+            gyroscope: scan.gyroscope.clone(),
             ..Scan::default()
         };
         if let Some(motion) = motion {
