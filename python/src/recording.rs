@@ -1,11 +1,14 @@
 //! Recordings, scans and sensors.
 
 use std::borrow::Cow;
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use anyhow::anyhow;
 use fpmcl::geometry::{Pose3, pose_from_degrees};
 use fpmcl::lidar;
+use fpmcl::mapping::calibrated;
+use fpmcl::odometry::OdometryConfig;
 use fpmcl::recording::{self, Layout, Selection};
 use fpmcl::sensor::{self, MotionCompensation, SensorConfig};
 use fpmcl::validation::Validate as _;
@@ -278,14 +281,16 @@ pub fn without_poses() -> PyErr {
 /// of the layout, such as ``"mulran"``; by default as the files show. ``topic``: of the point clouds in a bag with several, or name of a
 /// lidar or scene in a folder with several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used.
 /// ``motion_compensation``: ``"auto"``, ``"order"``, a rotation such as ``"clockwise"``, or None for compensated scans.
-/// ``elevation_bias_deg``: angle to add to the elevations of all points [deg].
+/// ``elevation_bias_deg``: angle to add to the elevations of all points [deg]. ``imu``: inertial measurements, a table, a folder
+/// ``oxts`` or a topic of the bag, by whose rates scans are compensated and rotations predicted; ``lidar_from_imu``: roll, pitch,
+/// yaw [deg] of its axes, if they are known.
 ///
 /// Raises Error if something cannot be read, with the file, and what to do.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "they have names in Python")]
 #[pyo3(signature = (
     path, poses=None, *, layout=None, topic=None, calib_file=None, body_from_lidar=None, start_idx=0, n_scans=-1, frame_step=1,
-    motion_compensation=Some("auto".to_owned()), elevation_bias_deg=0.0
+    motion_compensation=Some("auto".to_owned()), elevation_bias_deg=0.0, imu=None, lidar_from_imu=None
 ))]
 pub fn read_recording(
     py: Python<'_>,
@@ -300,6 +305,8 @@ pub fn read_recording(
     frame_step: usize,
     motion_compensation: Option<String>,
     elevation_bias_deg: f64,
+    imu: Option<PathBuf>,
+    lidar_from_imu: Option<[f64; 3]>,
 ) -> PyResult<Recording> {
     let selection = Selection {
         start_idx,
@@ -331,7 +338,17 @@ pub fn read_recording(
             None => recording,
         };
         let sensor = sensor::Sensor::infer_recording(&recording, &known)?;
-        anyhow::Ok((sensor.applied_to(recording), Sensor(sensor)))
+        let mut recording = sensor.applied_to(recording);
+        if let Some(path) = &imu {
+            let axes = lidar_from_imu.map(|[roll, pitch, yaw]| {
+                pose_from_degrees([0.0, 0.0, 0.0, roll, pitch, yaw]).rotation
+            });
+            let imu = recording.read_imu(path, axes)?;
+            let odometry = OdometryConfig::default();
+            let on_event = |_| ControlFlow::Continue(());
+            recording = calibrated(recording.with_imu(imu), &odometry, &on_event)?;
+        }
+        anyhow::Ok((recording, Sensor(sensor)))
     })?;
     Ok(Recording { recording, sensor })
 }

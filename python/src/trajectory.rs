@@ -57,6 +57,11 @@ pub fn odometry(
     let scans = Scans::of(scans)?;
     let found = released(py, || {
         let mut builder = TrajectoryBuilder::new(config)?;
+        if let Scans::Recorded(recording, _) = &scans
+            && let Some(imu) = &recording.imu
+        {
+            builder = builder.with_imu(imu.clone());
+        }
         for row in 0..scans.len() {
             builder.add(&*scans.read(row)?)?;
             Python::attach(|py| py.check_signals())?;

@@ -5,7 +5,8 @@
 //! H = Σ x̃ ỹᵀ = U S Vᵀ         R = U diag(1, 1, det(U Vᵀ)) Vᵀ         ~: without the mean, so that the bias cancels
 //! ```
 //!
-//! for each δ of a range; the best one is refined by a parabola. A mirrored sensor is one that R with a determinant of -1
+//! for each δ of a range; the best one is refined by a parabola. A mean rate is the logarithm of a rotation by its duration, as
+//! rotations about axes that change do not add up. A mirrored sensor is one that R with a determinant of -1
 //! fits far better.
 //!
 //! Umeyama, *Least-Squares Estimation of Transformation Parameters* (1991), for R; Furgale et al., *Unified Temporal
@@ -121,8 +122,9 @@ impl ImuCalibration {
         const LEAST: usize = 30;
         /// Differences that are dropped as errors of a single turn, in medians.
         const OUTLIER: f64 = 4.0;
-        let integral = Integral::new(&imu.samples);
-        let covered = integral.rates(turns, 0.0).len();
+        let samples = &*imu.samples;
+        let unbiased = Vector3::zeros();
+        let covered = rates(samples, turns, 0.0, &unbiased).len();
         if covered < LEAST {
             let [imu_first_s, imu_last_s] = imu.samples.span_s();
             return Err(ImuRejection::NotCovered {
@@ -138,9 +140,9 @@ impl ImuCalibration {
             return Err(ImuRejection::Saturated);
         }
         let given = imu.lidar_from_imu;
-        let (offset_s, fit) = best_offset(&integral, turns, given);
+        let (offset_s, fit) = best_offset(samples, turns, given, &unbiased);
         let differences = |turn: &MeasuredTurn| {
-            let rates = integral.rates(std::slice::from_ref(turn), offset_s);
+            let rates = rates(samples, std::slice::from_ref(turn), offset_s, &unbiased);
             rates.first().map(|pair| fit.difference(pair).norm())
         };
         let usual = median(turns.iter().filter_map(differences)).unwrap_or_default();
@@ -148,12 +150,14 @@ impl ImuCalibration {
             differences(turn).is_some_and(|difference| difference <= OUTLIER * usual)
         };
         let kept: Vec<MeasuredTurn> = turns.iter().filter(is_kept).copied().collect();
-        let (offset_s, fit) = best_offset(&integral, &kept, given);
+        // The rotation over a long turn depends on the bias by more than its mean.
+        let about_rad_s = fit.bias_rad_s;
+        let (offset_s, fit) = best_offset(samples, &kept, given, &about_rad_s);
         if let Some(given) = given
             && !fit.is_still()
             && !fit.is_explained()
         {
-            let (_, free) = best_offset(&integral, turns, None);
+            let (_, free) = best_offset(samples, turns, None, &about_rad_s);
             let turned_rad = free.lidar_from_imu.angle_to(&given);
             let turned_deg = free.is_explained().then_some(turned_rad.to_degrees());
             return Err(fit.unexplained(turned_deg));
@@ -167,25 +171,24 @@ impl ImuCalibration {
         Ok(Self {
             lidar_from_imu: fit.lidar_from_imu,
             offset_s,
-            rate_bias_rad_s: fit.bias_rad_s,
+            rate_bias_rad_s: about_rad_s + fit.bias_rad_s,
             residual_rad_s: fit.residual_rad_s,
             axes_sigma_rad: if given.is_some() { 0.0 } else { fit.sigma_rad },
         })
     }
 }
 
-/// The fit at the offset of the clocks that fits best.
+/// The fit at the offset of the clocks that fits best, with a bias that is about known.
 fn best_offset(
-    integral: &Integral,
+    samples: &ImuSamples,
     turns: &[MeasuredTurn],
     given: Option<UnitQuaternion<f64>>,
+    bias_rad_s: &Vector3<f64>,
 ) -> (f64, Fit) {
     const COARSE_S: f64 = 0.02;
     const FINE_S: f64 = 0.002;
-    let error = |offset_s: f64| {
-        let rates = integral.rates(turns, offset_s);
-        Fit::new(&rates, given).residual_rad_s
-    };
+    let fit = |offset_s: f64| Fit::new(&rates(samples, turns, offset_s, bias_rad_s), given);
+    let error = |offset_s: f64| fit(offset_s).residual_rad_s;
     let around = |middle_s: f64, step_s: f64, steps: i32| {
         let offsets = (-steps..=steps).map(|step| middle_s + f64::from(step) * step_s);
         let errors: Vec<(f64, f64)> = offsets
@@ -206,70 +209,28 @@ fn best_offset(
     } else {
         fine_s
     };
-    let fit = Fit::new(&integral.rates(turns, offset_s), given);
-    (offset_s, fit)
+    (offset_s, fit(offset_s))
 }
 
 /// Mean rates of the lidar and of the sensor over the same time [rad/s].
 type RatePair = [Vector3<f64>; 2];
 
-/// The integral of the rates from the first measurement on: the rotation vector of small turns.
-struct Integral<'a> {
-    samples: &'a ImuSamples,
-    until: Vec<Vector3<f64>>,
-    /// Number of gaps before each measurement.
-    gaps: Vec<usize>,
-}
-
-impl<'a> Integral<'a> {
-    fn new(samples: &'a ImuSamples) -> Self {
-        let mut steps = samples.steps().map(|[a, _]| a.time_s).peekable();
-        let (mut until, mut gaps) = (vec![Vector3::zeros()], vec![0]);
-        let (mut sum, mut missing) = (Vector3::zeros(), 0);
-        for pair in samples.rows().windows(2) {
-            let [a, b] = [&pair[0], &pair[1]];
-            sum += 0.5 * (b.time_s - a.time_s) * (a.rate_rad_s + b.rate_rad_s);
-            if steps.next_if(|&time_s| time_s == a.time_s).is_none() {
-                missing += 1;
-            }
-            until.push(sum);
-            gaps.push(missing);
-        }
-        Self {
-            samples,
-            until,
-            gaps,
-        }
-    }
-
-    /// The integral until a time, and the number of gaps before it; `None` outside of the measurements.
-    fn at(&self, time_s: f64) -> Option<(Vector3<f64>, usize)> {
-        let rows = self.samples.rows();
-        let after = rows.partition_point(|sample| sample.time_s <= time_s);
-        let (a, b) = (rows.get(after.checked_sub(1)?)?, rows.get(after)?);
-        let (since_s, period_s) = (time_s - a.time_s, b.time_s - a.time_s);
-        let change = (b.rate_rad_s - a.rate_rad_s) * (0.5 * since_s / period_s);
-        let part = (a.rate_rad_s + change) * since_s;
-        Some((self.until[after - 1] + part, self.gaps[after]))
-    }
-
-    /// Pairs of rates over the turns that are covered at an offset.
-    fn rates(&self, turns: &[MeasuredTurn], offset_s: f64) -> Vec<RatePair> {
-        (turns.iter())
-            .filter_map(|turn| {
-                let (first, gaps_before) = self.at(turn.from_s + offset_s)?;
-                let (last, gaps_after) = self.at(turn.to_s + offset_s)?;
-                let duration_s = turn.to_s - turn.from_s;
-                let is_covered = duration_s > 0.0 && gaps_before == gaps_after;
-                is_covered.then(|| {
-                    [
-                        turn.turn.scaled_axis() / duration_s,
-                        (last - first) / duration_s,
-                    ]
-                })
-            })
-            .collect()
-    }
+/// Pairs of rates over the turns that are covered at an offset between the clocks; those of the sensor are without a bias.
+fn rates(
+    samples: &ImuSamples,
+    turns: &[MeasuredTurn],
+    offset_s: f64,
+    bias_rad_s: &Vector3<f64>,
+) -> Vec<RatePair> {
+    (turns.iter())
+        .filter_map(|turn| {
+            let [from_s, to_s] = [turn.from_s, turn.to_s].map(|time_s| time_s + offset_s);
+            let measured = samples.turn(from_s, to_s, bias_rad_s)?;
+            let duration_s = turn.to_s - turn.from_s;
+            let rate = |turn: UnitQuaternion<f64>| turn.scaled_axis() / duration_s;
+            (duration_s > 0.0).then(|| [rate(turn.turn), rate(measured)])
+        })
+        .collect()
 }
 
 /// Axes and bias that fit pairs of rates best.

@@ -51,23 +51,28 @@ fn imu(rates: fn(f64) -> Vector3<f64>, offset_s: f64) -> Vec<ImuSample> {
         .collect()
 }
 
-/// Rotations between scans, with errors of a standard deviation.
+/// Rotations between scans, ten per second, with errors of a standard deviation.
 fn turns(rates: fn(f64) -> Vector3<f64>, sigma_rad: f64) -> Vec<MeasuredTurn> {
+    turns_every(0.1, rates, sigma_rad)
+}
+
+fn turns_every(period_s: f64, rates: fn(f64) -> Vector3<f64>, sigma_rad: f64) -> Vec<MeasuredTurn> {
     const STEPS: usize = 100;
     let mut rng = StdRng::seed_from_u64(3);
     let mut deviate = || -> f64 { StandardNormal.sample(&mut rng) };
-    (10..(DURATION_S * 10.0) as usize - 10)
+    let margin = (1.0 / period_s) as usize;
+    (margin..(DURATION_S / period_s) as usize - margin)
         .map(|scan| {
-            let from_s = 0.1 * scan as f64;
+            let from_s = period_s * scan as f64;
             let mut turn = UnitQuaternion::identity();
             for step in 0..STEPS {
-                let time_s = from_s + 0.1 * (step as f64 + 0.5) / STEPS as f64;
-                turn *= UnitQuaternion::from_scaled_axis(rates(time_s) * 0.1 / STEPS as f64);
+                let time_s = from_s + period_s * (step as f64 + 0.5) / STEPS as f64;
+                turn *= UnitQuaternion::from_scaled_axis(rates(time_s) * period_s / STEPS as f64);
             }
             let error = Vector3::new(deviate(), deviate(), deviate()) * sigma_rad;
             MeasuredTurn {
                 from_s,
-                to_s: from_s + 0.1,
+                to_s: from_s + period_s,
                 turn: turn * UnitQuaternion::from_scaled_axis(error),
             }
         })
@@ -104,6 +109,16 @@ fn axes_clock_and_bias_are_found() {
             assert!((noisy.rate_bias_rad_s - BIAS).norm() < 2e-3);
         }
     }
+}
+
+#[test]
+fn rotations_about_changing_axes_over_half_a_second_do_not_add_up_to_those_of_the_sensor() {
+    let shaken = |time_s: f64| 4.0 * hand(2.0 * time_s);
+    let found = estimate(imu(shaken, 0.05), &turns_every(0.5, shaken, 0.0), None).unwrap();
+    assert_relative_eq!(found.offset_s, 0.05, epsilon = 1e-3);
+    let off_rad = found.lidar_from_imu.angle_to(&mounting());
+    assert!(off_rad < 1e-3 && found.residual_rad_s < 0.02, "{found:?}");
+    assert!((found.rate_bias_rad_s - BIAS).norm() < 1e-3, "{found:?}");
 }
 
 #[test]

@@ -230,10 +230,13 @@ pub fn interpolate_motion(motion: &Pose3, fraction: f64) -> Pose3 {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use approx::assert_relative_eq;
     use nalgebra::Vector3;
 
     use super::*;
+    use crate::inertial::{GRAVITY_M_S2, Gyroscope, Imu, ImuCalibration, ImuSample, ImuSamples};
 
     fn motion() -> Pose3 {
         // An arc: 1.5 m of road with 0.06 rad of turn.
@@ -342,6 +345,59 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_measured_rotation_that_is_not_constant_is_compensated() {
+        // About x, once up and down in the sweep: at constant velocity there is none.
+        let angle = |time_s: f64| 0.2 * (PI * time_s / 0.05).sin();
+        let turned = |time_s| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), angle(time_s));
+        let samples = (-100..=100).map(|row| {
+            let time_s = 0.001 * f64::from(row);
+            ImuSample {
+                time_s: 7.0 + time_s,
+                rate_rad_s: Vector3::x() * 0.2 * PI / 0.05 * (PI * time_s / 0.05).cos(),
+                force_m_s2: Vector3::z() * GRAVITY_M_S2,
+            }
+        });
+        let imu = Imu {
+            samples: Arc::new(ImuSamples::new(samples.collect()).unwrap()),
+            lidar_from_imu: None,
+        };
+        let calibration = ImuCalibration {
+            lidar_from_imu: UnitQuaternion::identity(),
+            offset_s: 0.0,
+            rate_bias_rad_s: Vector3::zeros(),
+            residual_rad_s: 0.0,
+            axes_sigma_rad: 0.0,
+        };
+        let truth = Vector3::new(0.0, 20.0, 1.0);
+        let times_s: Vec<f64> = (-50..=50).map(|row| 0.001 * f64::from(row)).collect();
+        let seen = |time_s: &f64| Vec3::from((turned(*time_s).inverse() * truth).cast::<f32>());
+        let mut scan = Scan {
+            points: times_s.iter().map(seen).collect(),
+            times_s: times_s.iter().map(|&time_s| time_s as f32).collect(),
+            time_s: Some(7.0),
+            ..Scan::default()
+        };
+        let still = Motion {
+            previous_from_current: Pose3::identity(),
+            duration_s: 0.1,
+        };
+        let off_m = |mut scan: Scan| {
+            still.deskew(&mut scan);
+            let truth = Vec3::from(truth.cast::<f32>());
+            let distances = scan.points.iter().map(|point| point.distance(truth));
+            distances.fold(0.0, f32::max)
+        };
+        assert!(off_m(scan.clone()) > 3.5);
+        scan.gyroscope = Some(Arc::new(Gyroscope::new(&imu, calibration)));
+        // Half of an interval of the sweep at 12.6 rad/s.
+        let found_m = off_m(scan.clone());
+        assert!(found_m < 0.04, "{found_m}");
+        // Where nothing was measured, velocity is constant.
+        scan.time_s = Some(7.08);
+        assert!(off_m(scan) > 3.5);
     }
 
     #[test]

@@ -8,7 +8,9 @@
 //! results between the steps, takes them one by one: `with_given_poses`, `checked`, `PoseSearch`, `key_frames`.
 
 mod error;
+mod events;
 mod georeferenced;
+mod inertial;
 mod lost_path;
 mod pose_check;
 mod pose_report;
@@ -20,13 +22,14 @@ use std::sync::Arc;
 
 pub use error::MappingError;
 pub use georeferenced::georeferenced;
+pub use inertial::{CALIBRATION, calibrated};
 pub use lost_path::LostPath;
 pub use pose_report::{PoseReport, Tilt};
 pub use trajectory::{InertialSummary, LoopCounts, TrajectorySummary};
 
 pub(crate) use pose_search::PoseSearch;
 pub(crate) use poses::{check_path, checked, key_frames, poses_of, with_given_poses};
-pub(crate) use trajectory::{ADJUSTMENT, calibrate_imu, find_poses};
+pub(crate) use trajectory::{ADJUSTMENT, find_poses};
 
 use crate::map::{BuildError, Map, MapBuilder, MapConfig, MappingPath};
 use crate::odometry::Trajectory;

@@ -1,9 +1,10 @@
 //! The search for the poses of a recording that has none, or whose poses are polished.
 
 use super::error::MappingError;
+use super::events::OnEvent;
 use super::lost_path::LostPath;
 use super::poses::check_path;
-use super::trajectory::{OnEvent, each_scan, find_poses};
+use super::trajectory::{each_scan, find_poses};
 use crate::geometry::{Pose3, StampedPose};
 use crate::inertial::Imu;
 use crate::localization::{LocalizerConfig, SecondDrive, SecondDriveError, Tracker, TrackerConfig};

@@ -1,35 +1,30 @@
 //! Poses of scans, found from the scans themselves.
 
-use std::ops::ControlFlow;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
 use super::error::MappingError;
-use crate::inertial::{Gyroscope, Imu, ImuRejection};
+use super::events::{OnEvent, notify};
+use super::inertial::calibrate_imu;
+use crate::inertial::Imu;
 use crate::lidar::Scan;
 use crate::map::BuildEvent;
 use crate::memory::MemoryBudget;
 use crate::odometry::{
-    ElevationBias, GnssConstraints, ImuCalibrator, InertialEstimate, LoopVerdict, OdometryConfig,
-    StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
+    ElevationBias, GnssConstraints, InertialEstimate, LoopVerdict, StepState, Trajectory,
+    TrajectoryBuilder, TrajectoryConfig,
 };
 use crate::recording::Frame;
 
-/// The stage before the first scan, where there is an inertial sensor.
-pub const CALIBRATION: &str = "inertial sensor";
-
 /// The stage after the last scan.
 pub const ADJUSTMENT: &str = "loops and adjustment";
-
-/// Called for every event; the work ends soon after it returns `Break`.
-pub(super) type OnEvent<'a> = &'a dyn Fn(BuildEvent) -> ControlFlow<()>;
 
 /// Finds the poses of frames from their scans and fixes, where there are some, or polishes those that are given. An inertial
 /// sensor, where there is one, is calibrated by the first scans; its rates then predict rotations, and its forces make the
 /// poses level. If all scans contradict it, the poses are found without it.
 ///
-/// Its events are the stage [`CALIBRATION`] where there is a sensor, and the stage `"odometry"` or `"polish"`, every scan, and
+/// Its events are the stage [`CALIBRATION`](super::CALIBRATION) where there is a sensor, and the stage `"odometry"` or `"polish"`, every scan, and
 /// the stage [`ADJUSTMENT`].
 pub fn find_poses(
     frames: &[Frame],
@@ -41,7 +36,15 @@ pub fn find_poses(
     on_event: OnEvent,
 ) -> Result<Trajectory, MappingError> {
     let find = |frames: &[Frame], imu| {
-        find_poses_of(frames, are_given, imu, config, gnss, memory_budget, on_event)
+        find_poses_of(
+            frames,
+            are_given,
+            imu,
+            config,
+            gnss,
+            memory_budget,
+            on_event,
+        )
     };
     let Some(imu) = imu else {
         return find(frames, None);
@@ -93,24 +96,6 @@ fn find_poses_of(
     Ok(builder.finish()?)
 }
 
-/// Calibrates an inertial sensor by the first frames, or by all of them. Its only event is the stage [`CALIBRATION`], with every
-/// scan.
-pub fn calibrate_imu(
-    frames: &[Frame],
-    imu: &Imu,
-    config: &OdometryConfig,
-    on_event: OnEvent,
-) -> Result<Result<Gyroscope, ImuRejection>, MappingError> {
-    let mut calibrator = ImuCalibrator::new(imu.clone(), config.clone())?;
-    for frame in frames {
-        notify(on_event, BuildEvent::Stage(CALIBRATION))?;
-        if let Some(verdict) = calibrator.add(&frame.read()?)? {
-            return Ok(verdict);
-        }
-    }
-    Ok(calibrator.finish())
-}
-
 /// Reads the scans in order and passes each to `step`, until an event is answered with `Break`.
 pub(super) fn each_scan(
     name: &'static str,
@@ -124,14 +109,6 @@ pub(super) fn each_scan(
         notify(on_event, BuildEvent::ScanPrepared)?;
     }
     notify(on_event, BuildEvent::Stage(ADJUSTMENT))
-}
-
-/// Announces an event; an error where it is answered with `Break`.
-fn notify(on_event: OnEvent, event: BuildEvent) -> Result<(), MappingError> {
-    match on_event(event) {
-        ControlFlow::Continue(()) => Ok(()),
-        ControlFlow::Break(()) => Err(MappingError::Interrupted),
-    }
 }
 
 /// What a trajectory shows about itself.

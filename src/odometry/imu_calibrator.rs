@@ -79,8 +79,9 @@ impl ImuCalibrator {
         match ImuCalibration::estimate(&self.imu, &self.turns) {
             Ok(calibration) => (calibration.axes_sigma_rad.to_degrees() <= AXES_DEG)
                 .then(|| Ok(Gyroscope::new(&self.imu, calibration))),
-            Err(rejection) => (rejection.is_contradiction() && self.turns.len() >= MANY)
-                .then_some(Err(rejection)),
+            Err(rejection) => {
+                (rejection.is_contradiction() && self.turns.len() >= MANY).then_some(Err(rejection))
+            }
         }
     }
 }

@@ -70,4 +70,6 @@ pub(crate) use pose_check::{GivenPoses, check_poses};
 pub(crate) use timing::{TimingComparison, compare_timings};
 
 #[cfg(test)]
+mod gyroscope_tests;
+#[cfg(test)]
 mod tests;

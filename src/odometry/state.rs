@@ -580,7 +580,9 @@ mod tests {
             let predicted = state.predicted(periods * PERIOD_S, None);
             assert_relative_eq!(predicted.translation.x, periods, epsilon = 1e-9);
             // Without deviations so far: 0.3 voxels of 0.5 m, and 0.02 rad per period.
-            let prior = state.prior(periods * PERIOD_S, false, &config()).map(f64::sqrt);
+            let prior = state
+                .prior(periods * PERIOD_S, false, &config())
+                .map(f64::sqrt);
             assert_relative_eq!(prior.x, 0.15 * periods, epsilon = 1e-12);
             assert_relative_eq!(prior[5], 0.02 * periods, epsilon = 1e-12);
         }

@@ -329,6 +329,8 @@ def read_recording(
     frame_step: int = 1,
     motion_compensation: Optional[str] = "auto",
     elevation_bias_deg: float = 0.0,
+    imu: Optional[_Path] = None,
+    lidar_from_imu: Optional[ArrayLike] = None,
 ) -> Recording:
     """Opens a recording: a folder of scans (.bin, .pcd, .ply, .npy), a data set such as KITTI, MulRan or nuScenes, or a bag (MCAP, rosbag2,
     ROS 1).
@@ -339,7 +341,8 @@ def read_recording(
     ``"mulran"``; by default as the files show. ``topic``: of the point clouds in a bag with several, or name of a lidar or scene in a
     folder with several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used. ``motion_compensation``:
     ``"auto"``, a rotation such as ``"clockwise"``, or None for compensated scans. ``elevation_bias_deg``: angle to add to the
-    elevations of all points [deg].
+    elevations of all points [deg]. ``imu``: inertial measurements, a table, a folder ``oxts`` or a topic of the bag, by whose rates
+    scans are compensated and rotations predicted; ``lidar_from_imu``: roll, pitch, yaw [deg] of its axes, if they are known.
 
     Raises Error if something cannot be read, with the file, and what to do.
     """

@@ -14,7 +14,7 @@ use crate::app::settings::{
 };
 use crate::file_path::text_of;
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
-use crate::mapping::calibrate_imu;
+use crate::mapping::calibrated;
 use crate::odometry::{GnssConstraints, OdometryConfig};
 use crate::recording::{PoseTrack, Recording, RecordingError, is_topic};
 use crate::sensor::{Sensor, SensorConfig};
@@ -117,19 +117,9 @@ impl InertialConfig {
         context: &Context,
     ) -> Result<Recording> {
         let recording = self.open(recording)?;
-        let Some(imu) = &recording.imu else {
-            return Ok(recording);
-        };
         let interrupt = &context.interrupt;
-        let frames = recording.dense_frames();
-        let calibrated = calibrate_imu(&frames, imu, odometry, &|_| interrupt.flow());
-        match calibrated.map_err(|error| interrupt.explain(error))? {
-            Ok(gyroscope) => Ok(recording.with_gyroscope(gyroscope)),
-            Err(rejection) => {
-                tracing::warn!("the inertial sensor is left out: {rejection}");
-                Ok(recording)
-            }
-        }
+        calibrated(recording, odometry, &|_| interrupt.flow())
+            .map_err(|error| interrupt.explain(error))
     }
 }
 

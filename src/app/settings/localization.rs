@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{
-    GnssInputConfig, InertialConfig, MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig,
-    RecordingConfig, require_path,
+    GnssInputConfig, InertialConfig, MapInputConfig, MotionSourceConfig, OutputConfig,
+    PoseInputConfig, RecordingConfig, require_path,
 };
 use crate::file_path::FilePath;
 use crate::geometry::FARTHEST_M;
