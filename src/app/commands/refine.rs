@@ -68,7 +68,7 @@ pub struct RefineArgs {
 
     /// Inertial sensor whose rates compensate scans: a table of times, rates and forces, a folder oxts, or a topic of the bag; by default that of the localization. Sets the key `imu_file`.
     #[arg(long = "imu", value_name = "FILE")]
-    pub imu_file: Option<PathBuf>,
+    pub imu_file: Option<FilePath>,
 
     /// Result to write of a trajectory (.npz); sets the key `output_file`.
     #[arg(long = "output", value_name = "RESULT")]

@@ -70,7 +70,7 @@ pub struct LocalizeArgs {
 
     /// Inertial sensor whose rates predict rotations and compensate scans: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
     #[arg(long = "imu", value_name = "FILE")]
-    pub imu_file: Option<PathBuf>,
+    pub imu_file: Option<FilePath>,
 
     /// Positions of a GNSS receiver, a start in a map with a place on the Earth: sentences of NMEA, rows of time, latitude,
     /// longitude and height, a folder oxts, or a topic of the bag; sets the key `gnss_file`.
