@@ -157,17 +157,6 @@ impl schemars::JsonSchema for FilePath {
     }
 }
 
-#[cfg(feature = "cli")]
-impl clap::builder::ValueParserFactory for FilePath {
-    type Parser =
-        clap::builder::MapValueParser<clap::builder::PathBufValueParser, fn(PathBuf) -> Self>;
-
-    fn value_parser() -> Self::Parser {
-        use clap::builder::TypedValueParser as _;
-        clap::builder::PathBufValueParser::new().map(Self)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

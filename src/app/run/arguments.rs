@@ -2,10 +2,13 @@
 //! field that serializes under the name of that key.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use clap::Args;
+use clap::builder::{
+    MapValueParser, PathBufValueParser, TypedValueParser as _, ValueParserFactory,
+};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -39,6 +42,14 @@ impl ConfigArgs {
     /// What the command works on, where the argument is no configuration.
     pub fn input(&self) -> Option<&Path> {
         self.config.as_deref().filter(|path| !is_config(path))
+    }
+}
+
+impl ValueParserFactory for FilePath {
+    type Parser = MapValueParser<PathBufValueParser, fn(PathBuf) -> Self>;
+
+    fn value_parser() -> Self::Parser {
+        PathBufValueParser::new().map(Self::from)
     }
 }
 
