@@ -156,8 +156,8 @@ fn names_that_are_no_text_are_read_and_written_as_their_bytes() {
         .set("mesh_file", "map.ply")
         .succeeds();
     // Latin-1, and the character that is none.
-    for mark in [&b"\xe4"[..], "\u{fffe}".as_bytes()] {
-        let named = |end: &str| OsString::from_vec([&mark[..], end.as_bytes()].concat());
+    for mark in [b"\xe4".as_slice(), "\u{fffe}".as_bytes()] {
+        let named = |end: &str| OsString::from_vec([mark, end.as_bytes()].concat());
         let rename = |old: &str, new: &OsStr| {
             fs::rename(recording.path(old), recording.folder().join(new)).unwrap();
         };
