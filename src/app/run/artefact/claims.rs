@@ -10,6 +10,8 @@
 //! removed refined_tum.txt       is not claimed any more
 //! ```
 //!
+//! Backslashes and line breaks of names are written as `\\` and `\n`.
+//!
 //! Lines are only appended, so that processes may write to one folder at the same time. A line that a full disk cut, with
 //! no end, counts for nothing.
 
@@ -195,13 +197,13 @@ impl Claims {
 
     /// The state of an output of the folder; `None` if it is not claimed.
     pub fn state(&self, path: &Path) -> Option<&str> {
-        let state = self.states.get(&*name_of(path))?;
+        let state = self.states.get(&in_line(&name_of(path)))?;
         state.split(':').next()
     }
 
     /// The key of the inputs of an output; `None` if it has none.
     pub fn key(&self, path: &Path) -> Option<&str> {
-        let state = self.states.get(&*name_of(path))?;
+        let state = self.states.get(&in_line(&name_of(path)))?;
         Some(state.split_once(':')?.1)
     }
 
@@ -223,7 +225,7 @@ impl Claims {
 
     /// Removes the claimed ones of some files.
     pub fn remove(&mut self, names: &[&str]) -> Result<()> {
-        let is_claimed = |name: &&&str| self.states.contains_key(**name);
+        let is_claimed = |name: &&&str| self.states.contains_key(&in_line(name));
         let claimed: Vec<&str> = names.iter().filter(is_claimed).copied().collect();
         self.paths(&claimed)
             .try_for_each(|path| output::remove_if_exists(&path))?;
@@ -240,13 +242,13 @@ impl Claims {
     /// Appends a state of outputs; a claim does not change another state.
     fn set(&mut self, names: &[impl AsRef<str>], state: &str) -> Result<()> {
         let mut lines = String::new();
-        for name in names.iter().map(AsRef::as_ref) {
-            let found = self.states.get(name);
+        for name in names.iter().map(|name| in_line(name.as_ref())) {
+            let found = self.states.get(&name);
             if found.is_some_and(|found| found == state || state == "claimed") {
                 continue;
             }
             lines += &format!("{state} {name}\n");
-            self.states.insert(name.to_owned(), state.to_owned());
+            self.states.insert(name, state.to_owned());
         }
         if lines.is_empty() {
             return Ok(());
@@ -270,12 +272,14 @@ fn append(path: &Path, lines: &str) -> io::Result<()> {
     file.write_all(format!("{cut}{lines}").as_bytes())
 }
 
-/// The name of an output as in the claims: in one line.
+/// The name of an output, as the text of a path.
 fn name_of(path: &Path) -> Cow<'_, str> {
-    match text_of(Path::new(path.file_name().unwrap_or_default())) {
-        name if name.contains('\n') => name.replace('\n', "\\n").into(),
-        name => name,
-    }
+    text_of(Path::new(path.file_name().unwrap_or_default()))
+}
+
+/// A name as in the claims: in one line, no two names the same.
+fn in_line(name: &str) -> String {
+    name.replace('\\', "\\\\").replace('\n', "\\n")
 }
 
 #[cfg(test)]
@@ -306,6 +310,20 @@ mod tests {
         assert_eq!(claims.state(&victim), None);
         assert!(outputs(&victim).prepare().is_err());
         assert_eq!(fs::read(&victim).unwrap(), b"of the user");
+        // Neither does one of the other outputs, and it is known again.
+        let named = Outputs {
+            names: vec![
+                "y\nclaimed victim.npz".to_owned(),
+                "y\\nclaimed other".to_owned(),
+            ],
+            ..outputs(&main)
+        };
+        named.prepare().unwrap();
+        fs::write(folder.path().join(&named.names[0]), "of a run").unwrap();
+        named.prepare().unwrap();
+        let claims = Claims::read(folder.path()).unwrap();
+        assert_eq!(claims.state(&victim), None);
+        assert_eq!(claims.state(&folder.path().join("y\nclaimed other")), None);
     }
 
     #[cfg(unix)]
