@@ -7,11 +7,12 @@ use anyhow::{Context as _, Result, bail, ensure};
 use clap::Args;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 use crate::app::report::georeference::GeoreferenceReport;
 use crate::app::report::results::Value;
 use crate::app::report::{LocalizationResults, RunSummary};
-use crate::app::run::arguments::setting;
+use crate::app::run::arguments::{settings_parser, yaml};
 use crate::app::run::{MachineArgs, Printed, RecordingArgs, gibibytes, input};
 use crate::app::settings;
 use crate::evaluation::RangeMclRules;
@@ -37,7 +38,7 @@ pub struct InfoArgs {
     pub recording: RecordingArgs,
 
     /// Set the key topic, the topic of the scans in a bag with several, or a lidar or scene in a folder with several: topic=/NAME.
-    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = settings_parser())]
     pub settings: Vec<(String, String)>,
 
     /// Largest memory that a stage may plan for; by default half of the machine's.
@@ -78,7 +79,8 @@ impl Validate for InfoConfig {
 /// Describes what is at a path.
 pub fn run(args: &InfoArgs) -> Result<Printed> {
     let path = args.path.as_path();
-    let layout = (args.recording.layout.iter()).map(|name| ("layout".to_owned(), name.clone()));
+    let layout =
+        (args.recording.layout.iter()).map(|name| ("layout".to_owned(), yaml(&json!(name))));
     let settings: Vec<_> = args.settings.iter().cloned().chain(layout).collect();
     let config = settings::with_settings(InfoConfig::default(), &settings)?;
     ensure!(

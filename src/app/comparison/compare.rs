@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
 use crate::app::comparison::config::ComparisonConfig;
+use crate::app::run::arguments::command_of_job;
 use crate::app::run::{ConfigArgs, Context, Form, Printed, output};
 use crate::app::settings::{self, CommandConfig as _};
 
@@ -70,11 +71,8 @@ pub fn run(args: &CompareArgs, form: Form, context: &Context) -> Result<Printed>
 /// One shell command per run, for the current folder: the command line of this process with
 /// `--job` instead of `--list-jobs`.
 fn job_commands(runs: &[PlannedRun]) -> String {
-    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned());
-    let command = shell_words::join(words.filter(|word| word != "--list-jobs"));
-    runs.iter()
-        .map(|run| format!("{command} --job {}\n", run.id))
-        .collect()
+    let jobs = runs.iter().map(|run| format!("--job {}", run.id));
+    jobs.map(|job| command_of_job(&job) + "\n").collect()
 }
 
 /// Simulates the drives and builds the maps; returns the folders of the maps.

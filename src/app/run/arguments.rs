@@ -2,18 +2,19 @@
 //! field that serializes under the name of that key.
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use clap::Args;
 use clap::builder::{
-    MapValueParser, PathBufValueParser, TypedValueParser as _, ValueParserFactory,
+    MapValueParser, OsStringValueParser, PathBufValueParser, TypedValueParser, ValueParserFactory,
 };
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::context::{Context, MachineArgs};
-use super::visible::visible;
+use super::visible::{visible, visible_in_line};
 use crate::app::settings::{self, CommandConfig};
 use crate::file_path::{FilePath, text_of};
 
@@ -25,7 +26,7 @@ pub struct ConfigArgs {
     pub config: Option<FilePath>,
 
     /// Override a key, such as range_image.width=1024; repeatable.
-    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = settings_parser())]
     pub settings: Vec<(String, String)>,
 
     /// Renderer and threads.
@@ -168,8 +169,34 @@ pub fn numbers<const N: usize>(text: &str, help: &'static str) -> Result<[f64; N
         .ok_or(help)
 }
 
+/// The command line of this process with other words instead of `--list-jobs`, for a shell.
+pub fn command_of_job(words: &str) -> String {
+    let given = std::env::args_os().filter(|word| word != "--list-jobs");
+    let given: Vec<String> = given.map(|word| shell_word(&word)).collect();
+    format!("{} {words}", given.join(" "))
+}
+
+/// A word for a shell, in one line: bytes that are no printable text as `\xNN` in `$'...'` (POSIX.1-2024, section 2.2.4).
+fn shell_word(word: &OsStr) -> String {
+    let plain = word.to_str().filter(|text| visible_in_line(text) == *text);
+    if let Some(plain) = plain.filter(|text| !text.contains('\t')) {
+        return shell_words::quote(plain).into_owned();
+    }
+    let escaped = word.as_encoded_bytes().iter().map(|&byte| match byte {
+        b'\'' | b'\\' => format!("\\{}", char::from(byte)),
+        b' '..=b'~' => char::from(byte).to_string(),
+        byte => format!("\\x{byte:02x}"),
+    });
+    format!("$'{}'", escaped.collect::<String>())
+}
+
+/// Parses `key=value`, also of paths that are not UTF-8.
+pub fn settings_parser() -> impl TypedValueParser<Value = (String, String)> {
+    OsStringValueParser::new().try_map(|text| setting(&text_of(Path::new(&text))))
+}
+
 /// Splits `key=value` at the first `=`.
-pub fn setting(text: &str) -> Result<(String, String), &'static str> {
+fn setting(text: &str) -> Result<(String, String), &'static str> {
     match text.split_once('=') {
         Some((key, value)) if !key.trim().is_empty() => {
             Ok((key.trim().to_owned(), value.to_owned()))
@@ -181,6 +208,30 @@ pub fn setting(text: &str) -> Result<(String, String), &'static str> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn any_argument_is_a_word_of_a_shell_in_one_line() {
+        use std::os::unix::ffi::OsStrExt as _;
+        let names: [&[u8]; 6] = [
+            b"a b",
+            b"caf\xe9",
+            b"a\nb'c",
+            b"\x1b[31m\\x",
+            b"plain",
+            "\u{202e}ä".as_bytes(),
+        ];
+        for name in names {
+            let word = shell_word(OsStr::from_bytes(name));
+            assert_eq!(visible_in_line(&word), word);
+            let printed = std::process::Command::new("bash")
+                .arg("-c")
+                .arg(format!("printf %s {word}"))
+                .output()
+                .unwrap();
+            assert_eq!(printed.stdout, name, "{word}");
+        }
+    }
 
     #[test]
     fn a_setting_is_split_at_its_first_equals_sign() {

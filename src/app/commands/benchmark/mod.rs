@@ -78,7 +78,7 @@ pub struct BenchmarkArgs {
     pub output: FilePath,
 
     /// Value of a key of any stage that has it; repeatable.
-    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = crate::app::run::arguments::setting)]
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = crate::app::run::arguments::settings_parser())]
     pub settings: Vec<(String, String)>,
 
     /// Seed of all random choices.

@@ -2,7 +2,6 @@
 //! process, or as independent jobs on any number of machines that share the folder of the map.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::sync::{Arc, Mutex};
 
 use anyhow::{Context as _, Result, bail};
@@ -10,6 +9,7 @@ use anyhow::{Context as _, Result, bail};
 use super::opened::{Opened, open};
 use super::parts::{Parts, Role};
 use super::progress::BuildProgress;
+use crate::app::run::arguments::command_of_job;
 use crate::app::run::artefact::hash::{hash_of_scan, hash_of_scans, joint_hash};
 use crate::app::run::memory;
 use crate::app::run::{Context, Printed};
@@ -54,13 +54,9 @@ pub fn build(
 /// `--job` instead of `--list-jobs`. The poses are found first.
 pub fn list_jobs(config: &BuildMapConfig, context: &Context) -> Result<Printed> {
     let (opened, _claims) = open(config, Role::Build, context)?;
-    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned());
-    let command = shell_words::join(words.filter(|word| word != "--list-jobs"));
-    let mut commands = String::new();
-    for number in missing(&opened) {
-        writeln!(commands, "{command} --job {number}")?;
-    }
-    Ok(Printed::text(commands))
+    let jobs = missing(&opened).into_iter();
+    let commands = jobs.map(|number| command_of_job(&format!("--job {number}")) + "\n");
+    Ok(Printed::text(commands.collect::<String>()))
 }
 
 /// Builds a local map by its number.

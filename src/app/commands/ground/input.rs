@@ -6,7 +6,7 @@ use anyhow::{Result, bail, ensure};
 use clap::Args;
 
 use crate::app::run::MachineArgs;
-use crate::app::run::arguments::{is_config, require_input, setting};
+use crate::app::run::arguments::{is_config, require_input, settings_parser};
 use crate::app::run::input::is_bag;
 use crate::app::run::input::require_folder;
 use crate::app::settings::{self, GroundCommandConfig};
@@ -41,7 +41,7 @@ pub struct GroundArgs {
     pub config: Option<FilePath>,
 
     /// Override a key, such as ground_method=pca; repeatable.
-    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = settings_parser())]
     pub settings: Vec<(String, String)>,
 
     /// Replace existing output; sets the key `force`.
