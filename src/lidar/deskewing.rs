@@ -135,8 +135,8 @@ impl Motion {
         interpolate_motion(&self.previous_from_current, time_s / self.duration_s)
     }
 
-    /// Moves the points of a scan to the moment of its pose; its rotation is the measured one where there is one. Afterwards the scan has no times; a scan
-    /// without times is unchanged.
+    /// Moves the points of a scan to the moment of its pose; its rotation is the measured one where there is one. Afterwards
+    /// the scan has no times; a scan without times is unchanged.
     pub fn deskew(&self, scan: &mut Scan) {
         let sweep = Sweep::spanning(scan.times_s.iter().copied());
         let turns = sweep.turns(scan.measured_rotation().as_ref());

@@ -35,16 +35,22 @@ pub fn find_poses(
     memory_budget: MemoryBudget,
     on_event: OnEvent,
 ) -> Result<Trajectory, MappingError> {
-    let find = |frames: &[Frame], imu| {
-        find_poses_of(
-            frames,
-            are_given,
-            imu,
-            config,
-            gnss,
-            memory_budget,
-            on_event,
-        )
+    let find = |frames: &[Frame], imu: Option<&Imu>| {
+        let builder = TrajectoryBuilder::new(config.clone())?;
+        let builder = builder.with_memory_budget(memory_budget);
+        let mut builder = builder.with_gnss(gnss.cloned());
+        if let Some(imu) = imu {
+            builder = builder.with_imu(imu.clone());
+        }
+        let name = if are_given { "polish" } else { "odometry" };
+        each_scan(name, frames, on_event, |frame, scan| {
+            match frame.map_from_lidar {
+                Some(pose) if are_given => builder.add_given(scan, pose)?,
+                _ => drop(builder.add(scan)?),
+            }
+            Ok(())
+        })?;
+        Ok(builder.finish()?)
     };
     let Some(imu) = imu else {
         return find(frames, None);
@@ -67,33 +73,6 @@ pub fn find_poses(
     } else {
         find(frames, None)
     }
-}
-
-/// Finds or polishes poses; an inertial sensor makes them level.
-fn find_poses_of(
-    frames: &[Frame],
-    are_given: bool,
-    imu: Option<&Imu>,
-    config: &TrajectoryConfig,
-    gnss: Option<&GnssConstraints>,
-    memory_budget: MemoryBudget,
-    on_event: OnEvent,
-) -> Result<Trajectory, MappingError> {
-    let builder = TrajectoryBuilder::new(config.clone())?;
-    let builder = builder.with_memory_budget(memory_budget);
-    let mut builder = builder.with_gnss(gnss.cloned());
-    if let Some(imu) = imu {
-        builder = builder.with_imu(imu.clone());
-    }
-    let name = if are_given { "polish" } else { "odometry" };
-    each_scan(name, frames, on_event, |frame, scan| {
-        match frame.map_from_lidar {
-            Some(pose) if are_given => builder.add_given(scan, pose)?,
-            _ => drop(builder.add(scan)?),
-        }
-        Ok(())
-    })?;
-    Ok(builder.finish()?)
 }
 
 /// Reads the scans in order and passes each to `step`, until an event is answered with `Break`.

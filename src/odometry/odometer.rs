@@ -40,8 +40,8 @@ pub enum StepState {
     Registered,
     /// Registered to the local map, after a motion that was a surprise or that only a wide search found.
     Doubtful,
-    /// Predicted by constant velocity, with the rotation of a gyroscope where there is one; the scan is not mapped. It has too few points, it does not fit the local
-    /// map, or the motion to where it fits is impossible.
+    /// Predicted by constant velocity, with the rotation of a gyroscope where there is one; the scan is not mapped. It has
+    /// too few points, it does not fit the local map, or the motion to where it fits is impossible.
     Predicted,
     /// The same; after several in turn the local map begins again with this scan, and the motion to it is unknown.
     Lost,

@@ -100,7 +100,7 @@ impl BenchmarkArgs {
                 || settings::has_key::<EvaluationConfig>(key)?;
             ensure!(
                 is_known,
-                "--set {key}: neither odometry nor build-map, localize nor evaluate has this key; `fpmcl localize --print-config` and that of the others show their keys"
+                "--set {key}: none of odometry, build-map, localize and evaluate has this key; `fpmcl config localize --full` prints the keys of localize, and so for the others"
             );
         }
         Ok(())
@@ -322,6 +322,7 @@ impl Session {
         };
         let no_poses = PoseInputConfig::default();
         let opened = RecordingInputs::new(&recording, &no_poses).open()?;
+        let is_given = truth.is_some();
         let (truth, calibration) = match truth {
             Some(truth) => (
                 Some(truth.to_owned()),
@@ -335,9 +336,12 @@ impl Session {
                 folder.display()
             );
         }
+        // Poses of the layout are part of the recording.
         let mut content = vec![hash_of_recording(&opened)?];
-        for file in truth.iter().chain(&calibration) {
-            content.push(hash_of_file(file)?);
+        if is_given {
+            for file in truth.iter().chain(&calibration) {
+                content.push(hash_of_file(file)?);
+            }
         }
         Ok(Self {
             recording,

@@ -10,6 +10,7 @@ use super::older::{self, OlderMap};
 use super::parts::{Parts, Role};
 use super::poses;
 use crate::app::commands::trajectory::poses_next_to;
+use crate::app::run::artefact::hash::hash_of_debug;
 use crate::app::run::{Claims, Context, version};
 use crate::app::settings::{self, BuildMapConfig, OutputConfig};
 use crate::file_path::{FilePath, text_of};
@@ -143,7 +144,7 @@ fn inputs_of(
         writeln!(text, "onto {}", older.hash)?;
     }
     if let Some(gyroscope) = frames.first().and_then(|frame| frame.gyroscope.as_ref()) {
-        writeln!(text, "{gyroscope:?}")?;
+        writeln!(text, "{}", hash_of_debug(gyroscope))?;
     }
     for frame in frames {
         let path = &frame.source;

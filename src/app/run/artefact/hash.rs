@@ -1,5 +1,6 @@
 //! Hashes of inputs.
 
+use std::fmt::{self, Write as _};
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
@@ -37,6 +38,21 @@ pub fn hash_of_texts(parts: &[impl AsRef<str>]) -> String {
         hasher.update(part.as_bytes());
     }
     hasher.finalize().to_hex()[..32].to_owned()
+}
+
+/// Hash of a value as it is written for debugging, of which the text is not kept: it may be long.
+pub fn hash_of_debug(value: &impl fmt::Debug) -> String {
+    struct Text(blake3::Hasher);
+    impl fmt::Write for Text {
+        fn write_str(&mut self, part: &str) -> fmt::Result {
+            self.0.update(part.as_bytes());
+            Ok(())
+        }
+    }
+    let mut text = Text(blake3::Hasher::new());
+    // The hasher takes every part.
+    let _ = write!(text, "{value:?}");
+    text.0.finalize().to_hex().to_string()
 }
 
 /// Hash of the scans of a recording with their numbers and times, and of its files of poses and calibration.
