@@ -27,6 +27,19 @@ impl Gyroscope {
         }
     }
 
+    /// A sensor without errors, in the axes and on the clock of the lidar.
+    #[cfg(test)]
+    pub fn exact(imu: &Imu) -> Self {
+        let calibration = ImuCalibration {
+            lidar_from_imu: UnitQuaternion::identity(),
+            offset_s: 0.0,
+            rate_bias_rad_s: nalgebra::Vector3::zeros(),
+            residual_rad_s: 0.0,
+            axes_sigma_rad: 0.0,
+        };
+        Self::new(imu, calibration)
+    }
+
     /// Rotation `first_from_last` of the lidar from a time to a later one [s]; `None` where measurements are missing.
     pub fn turn(&self, from_s: f64, to_s: f64) -> Option<UnitQuaternion<f64>> {
         let ImuCalibration {

@@ -236,7 +236,7 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
-    use crate::inertial::{GRAVITY_M_S2, Gyroscope, Imu, ImuCalibration, ImuSample, ImuSamples};
+    use crate::inertial::{GRAVITY_M_S2, Gyroscope, Imu, ImuSample, ImuSamples};
 
     fn motion() -> Pose3 {
         // An arc: 1.5 m of road with 0.06 rad of turn.
@@ -364,13 +364,6 @@ mod tests {
             samples: Arc::new(ImuSamples::new(samples.collect()).unwrap()),
             lidar_from_imu: None,
         };
-        let calibration = ImuCalibration {
-            lidar_from_imu: UnitQuaternion::identity(),
-            offset_s: 0.0,
-            rate_bias_rad_s: Vector3::zeros(),
-            residual_rad_s: 0.0,
-            axes_sigma_rad: 0.0,
-        };
         let truth = Vector3::new(0.0, 20.0, 1.0);
         let times_s: Vec<f64> = (-50..=50).map(|row| 0.001 * f64::from(row)).collect();
         let seen = |time_s: &f64| Vec3::from((turned(*time_s).inverse() * truth).cast::<f32>());
@@ -391,7 +384,7 @@ mod tests {
             distances.fold(0.0, f32::max)
         };
         assert!(off_m(scan.clone()) > 3.5);
-        scan.gyroscope = Some(Arc::new(Gyroscope::new(&imu, calibration)));
+        scan.gyroscope = Some(Arc::new(Gyroscope::exact(&imu)));
         // Half of an interval of the sweep at 12.6 rad/s.
         let found_m = off_m(scan.clone());
         assert!(found_m < 0.04, "{found_m}");

@@ -7,9 +7,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use super::tests::World;
 use super::{ImuCalibrator, Odometer, OdometryConfig, OdometryEstimate, StepState};
 use crate::geometry::Pose3;
-use crate::inertial::{
-    GRAVITY_M_S2, Gyroscope, Imu, ImuCalibration, ImuRejection, ImuSample, ImuSamples,
-};
+use crate::inertial::{GRAVITY_M_S2, Gyroscope, Imu, ImuRejection, ImuSample, ImuSamples};
 use crate::lidar::{Rotation, RotationDirection, Scan};
 
 const PERIOD_S: f64 = 0.5;
@@ -63,14 +61,7 @@ fn imu(seconds: usize, factor: f64) -> Imu {
 }
 
 fn with_gyroscope(scans: &[Scan]) -> Vec<Scan> {
-    let calibration = ImuCalibration {
-        lidar_from_imu: UnitQuaternion::identity(),
-        offset_s: 0.0,
-        rate_bias_rad_s: Vector3::zeros(),
-        residual_rad_s: 0.0,
-        axes_sigma_rad: 0.0,
-    };
-    let gyroscope = Arc::new(Gyroscope::new(&imu(scans.len() / 2, 1.0), calibration));
+    let gyroscope = Arc::new(Gyroscope::exact(&imu(scans.len() / 2, 1.0)));
     let measured = |scan: &Scan| Scan {
         gyroscope: Some(gyroscope.clone()),
         ..scan.clone()
