@@ -27,9 +27,10 @@ const CHUNK_CELLS: i64 = 64;
 /// Triangles with longer edges are large [m].
 const LARGE_EDGE_M: f64 = 500.0;
 
-/// A large triangle that is narrower than this part of its longest edge is an artefact, one with a lost vertex, not the
-/// surface of a road.
-const NARROW: f64 = 0.01;
+/// A large triangle that is narrower than this, or than this part of its longest edge, is an artefact, one with a lost
+/// vertex, not the surface of a road: no lane is that narrow, nor is one of 5 m straight and level for 50 km [m].
+const NARROW_M: f64 = 2.0;
+const NARROW: f64 = 1e-4;
 
 /// Largest size of the chunks that a map in memory keeps, of about 16 kB per level each [bytes].
 const KEPT_BYTES: usize = 1 << 26;
@@ -332,7 +333,8 @@ pub(crate) fn is_large([a, b, c]: [DVec3; 3]) -> bool {
 pub(crate) fn is_artefact(corners: [DVec3; 3]) -> bool {
     let [a, b, c] = corners.map(DVec3::truncate);
     let longest_m = (b - a).length().max((c - a).length()).max((c - b).length());
-    is_large(corners) && (b - a).perp_dot(c - a).abs() < NARROW * longest_m * longest_m
+    let width_m = (b - a).perp_dot(c - a).abs() / longest_m;
+    is_large(corners) && width_m < NARROW_M.max(NARROW * longest_m)
 }
 
 /// Middle of a chunk of cells of an edge.

@@ -466,6 +466,22 @@ mod tests {
     }
 
     #[test]
+    fn a_floor_of_long_strips_is_ground() {
+        let strip = |row: i8| {
+            let y = 5.0 * f32::from(row);
+            ([-500.0, y, 500.0, y + 5.0], 0.0)
+        };
+        let strips: Vec<_> = (-10..10).map(strip).collect();
+        let roof = ([20.0, 20.0, 40.0, 30.0], 6.0);
+        for rectangles in [strips.clone(), [strips, vec![roof]].concat()] {
+            let (found, ground) = ground_of_rectangles(&rectangles);
+            assert_eq!(found[..40], [true; 40]);
+            assert!(found[40..].iter().all(|is_ground| !is_ground));
+            assert!((ground.area_m2() / 1e5 - 1.0).abs() < 0.1);
+        }
+    }
+
+    #[test]
     fn an_outlier_neither_is_ground_nor_makes_the_cells_of_the_others_larger() {
         let mut mesh = TriangleMesh::default();
         sheet(&mut mesh, [0.0, 40.0], [-5.0, 5.0], [0.0, 0.0]);
