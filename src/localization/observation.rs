@@ -273,20 +273,26 @@ pub fn ranges_along(
 }
 
 /// Returns the share of beams that end on a surface of the map, among those that reach one; `None` for
-/// fewer than 30 of them. Measured and rendered ranges agree within the tolerance. Beams that end in
-/// front of the map, on traffic, and beams along which it has no surface do not count.
+/// fewer than 30 of them. Measured and rendered ranges agree within the tolerance. Beams along which the map has no
+/// surface do not count, nor do those that end in front of the map, on traffic, as long as they are no more than those
+/// that agree: traffic that hides most of the map is a wrong pose, or a sensor whose ranges are too short.
 pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option<f64> {
     /// Smallest number of beams.
     const MIN_BEAMS: usize = 30;
-    let excesses_m: Vec<f32> = beams
-        .iter()
-        .zip(rendered_m)
-        .filter(|&(_, &rendered_m)| rendered_m != f32::INFINITY)
-        .map(|(beam, rendered_m)| beam.range_m - rendered_m)
-        .filter(|&excess_m| excess_m >= -tolerance_m)
-        .collect();
-    let hits = excesses_m.iter().filter(|&&m| m <= tolerance_m).count();
-    (excesses_m.len() >= MIN_BEAMS).then(|| hits as f64 / excesses_m.len() as f64)
+    let (mut on, mut behind, mut in_front) = (0_usize, 0_usize, 0_usize);
+    for (beam, &rendered_m) in beams.iter().zip(rendered_m) {
+        let excess_m = beam.range_m - rendered_m;
+        if rendered_m == f32::INFINITY {
+        } else if excess_m < -tolerance_m {
+            in_front += 1;
+        } else if excess_m <= tolerance_m {
+            on += 1;
+        } else {
+            behind += 1;
+        }
+    }
+    let reaching = on + behind + in_front.saturating_sub(on);
+    (reaching >= MIN_BEAMS).then(|| on as f64 / reaching as f64)
 }
 
 /// Returns the beams that end above the road, which distinguish one place from another.
@@ -420,6 +426,10 @@ mod tests {
         assert_eq!(agreement(&beams, &[10.0; 90], 0.3), Some(1.0));
         assert_eq!(agreement(&beams, &[7.0; 90], 0.3), Some(0.0));
         assert_eq!(agreement(&beams, &[f32::INFINITY; 90], 0.3), None);
+        // Where 60 beams end in front of the surfaces on which 30 end, it is not traffic.
+        let mut rendered_m = [12.0; 90];
+        rendered_m[60..].fill(10.0);
+        assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(0.5));
         // 40 beams end behind the surface, 50 on it.
         let mut rendered_m = [4.0; 90];
         rendered_m[40..].fill(10.2);
