@@ -102,6 +102,14 @@ impl BlockSystem {
         .then_some(solution)
     }
 
+    /// Logarithm of the determinant of a chain, in which only neighbouring rows are connected; `None` if the system is not
+    /// positive definite.
+    pub fn log_determinant(&self) -> Option<f64> {
+        let factors = self.factorize()?.0;
+        let of_row = |factor: &Factor| 2.0 * factor.own.l_dirty().diagonal().map(f64::ln).sum();
+        Some(factors.iter().map(of_row).sum())
+    }
+
     fn times(&self, vector: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
         (0..self.diagonal.len())
             .into_par_iter()
@@ -231,6 +239,26 @@ mod tests {
         let differences: Vec<Vector6<f64>> = differences.collect();
         let all = dot(&system.right_side, &system.right_side).sqrt();
         assert!(dot(&differences, &differences).sqrt() < 1e-3 * all);
+    }
+
+    #[test]
+    fn the_determinant_of_a_chain_is_that_of_its_matrix() {
+        let mut system = BlockSystem::new(3);
+        let mut matrix = nalgebra::DMatrix::zeros(18, 18);
+        for row in 0..3 {
+            let own = block(row) * block(row).transpose() + Matrix6::identity() * 4.0;
+            system.add(row, &own, &Vector6::zeros());
+            matrix.view_mut((6 * row, 6 * row), (6, 6)).copy_from(&own);
+        }
+        for row in 0..2 {
+            let next = block(row + 10) * 0.3;
+            system.add_off_diagonal(row, row + 1, &next);
+            let (here, there) = (6 * row, 6 * row + 6);
+            matrix.view_mut((here, there), (6, 6)).copy_from(&next);
+            (matrix.view_mut((there, here), (6, 6))).copy_from(&next.transpose());
+        }
+        let expected = matrix.determinant().ln();
+        assert!((system.log_determinant().unwrap() - expected).abs() < 1e-9 * expected.abs());
     }
 
     #[test]

@@ -9,7 +9,8 @@
 //!
 //! R is the rotation `odom_from_imu`. The direction up in that frame changes as slowly as the odometry drifts, and the bias b of
 //! the accelerometer changes less: both are a random walk from window to window, found by robust least squares. A bias and a
-//! tilt look the same until the drive turns.
+//! tilt look the same until the drive turns. How fast the odometry drifts is that for which the measurements are most likely
+//! (marginal likelihood): one that hardly drifts keeps its shape, which it knows better than an accelerometer.
 //!
 //! The odometry is then integrated again with rotations whose tilt is that of gravity, so that its height follows, and
 //! each scan keeps its direction up as a weak constraint of the loops and of the adjustment.
@@ -233,6 +234,8 @@ fn windows(drive: &DrivenPath, samples: &ImuSamples, calibration: &ImuCalibratio
 /// Directions up in the frame of the odometry, and the bias.
 struct Ups {
     times_s: Vec<f64>,
+    /// Standard deviation of the drift, in units of the fastest one.
+    drift: f64,
     /// The direction up of the whole drive, before its changes.
     up: Vector3<f64>,
     turns: Vec<UnitQuaternion<f64>>,
@@ -242,13 +245,25 @@ struct Ups {
 }
 
 impl Ups {
-    /// The directions and biases that fit windows best; `None` with fewer than two windows.
+    /// The directions and biases that fit windows best, with the drift for which they are most likely; `None` with fewer than
+    /// two windows.
     fn fit(windows: &[Window]) -> Option<Self> {
+        /// Halvings of the fastest drift; the slowest one tilts by less than 0.01 degrees in a kilometre.
+        const HALVINGS: i32 = 9;
+        let fits = (0..HALVINGS).map(|halving| Self::fit_with(windows, 0.5_f64.powi(halving)));
+        let fits: Option<Vec<(f64, Self)>> = fits.collect();
+        let likeliest = fits?.into_iter().min_by(|a, b| a.0.total_cmp(&b.0))?;
+        Some(likeliest.1)
+    }
+
+    /// The directions and biases that fit windows best with a drift, and -2 log of the likelihood of the measurements.
+    fn fit_with(windows: &[Window], drift: f64) -> Option<(f64, Self)> {
         const ITERATIONS: usize = 8;
         let sum: Vector3<f64> = windows.iter().map(|window| window.force).sum();
         let up = Unit::try_new(sum, 1e-6)?.into_inner();
         let mut ups = Self {
             times_s: windows.iter().map(|window| window.time_s).collect(),
+            drift,
             up,
             turns: vec![UnitQuaternion::identity(); windows.len()],
             biases: vec![Vector3::zeros(); windows.len()],
@@ -258,9 +273,10 @@ impl Ups {
         if windows.len() < 2 {
             return None;
         }
+        let mut improbability = f64::INFINITY;
         for iteration in 0..ITERATIONS {
             ups.residual_m_s2 = ups.residual(windows);
-            let system = ups.system(windows);
+            let (cost, system) = ups.system(windows);
             for (row, step) in system.solve()?.iter().enumerate() {
                 let turn: Vector3<f64> = step.fixed_rows::<3>(0).into();
                 let turn = UnitQuaternion::from_scaled_axis(turn);
@@ -269,10 +285,14 @@ impl Ups {
             }
             if iteration + 1 == ITERATIONS {
                 ups.sigma_rad = ups.sigma(&system)?;
+                // The information of the drift is proportional to drift⁻² in three axes of each step.
+                improbability = cost
+                    + system.log_determinant()?
+                    + 6.0 * (windows.len() as f64) * (drift.ln() + ups.sigma_m_s2().ln());
             }
         }
         ups.residual_m_s2 = ups.residual(windows);
-        Some(ups)
+        Some((improbability, ups))
     }
 
     fn difference(&self, row: usize, window: &Window) -> Vector3<f64> {
@@ -291,17 +311,17 @@ impl Ups {
 
     /// The standard deviation that the differences are weighted by [m/s²].
     fn sigma_m_s2(&self) -> f64 {
-        /// Least one: vibrations and scale are not known better.
-        const LEAST_M_S2: f64 = 0.01;
+        /// Least one, a tilt of 0.01 degrees: no accelerometer is known better.
+        const LEAST_M_S2: f64 = 0.002;
         self.residual_m_s2.max(LEAST_M_S2)
     }
 
-    /// Linearized equations of the changes: turns in the frame of the odometry, and biases.
-    fn system(&self, windows: &[Window]) -> BlockSystem {
+    /// Cost, and linearized equations of the changes: turns in the frame of the odometry, and biases.
+    fn system(&self, windows: &[Window]) -> (f64, BlockSystem) {
         /// Standard deviation of the bias [m/s²], and of its change [m/s² per √s].
         const BIAS_M_S2: f64 = 0.3;
         const BIAS_WALK: f64 = 5e-4;
-        /// Standard deviation of the drift of the tilt [rad/m], and per window [rad].
+        /// Standard deviation of the fastest drift of the tilt [rad/m], and per window [rad].
         const TILT_RAD_PER_M: f64 = 1e-4;
         const TILT_RAD: f64 = 2e-4;
         /// Turns about the direction up are not measured [rad].
@@ -309,11 +329,13 @@ impl Ups {
         /// Scale of the robust kernel, in standard deviations.
         const KERNEL: f64 = 3.0;
         let sigma = self.sigma_m_s2();
+        let mut cost = 0.0;
         let mut system = BlockSystem::new(windows.len());
         for (row, window) in windows.iter().enumerate() {
             let difference = self.difference(row, window);
             let square = (difference.norm() / (KERNEL * sigma)).powi(2);
             let information = (sigma * (1.0 + square)).powi(-2);
+            cost += KERNEL * KERNEL * square / (1.0 + square);
             // difference(δ) = difference + by_turn δ − R δ_b.
             let by_turn = (self.turns[row] * self.up * GRAVITY_M_S2).cross_matrix();
             let mut jacobian = nalgebra::Matrix3x6::zeros();
@@ -330,7 +352,8 @@ impl Ups {
         let held = Matrix6::from_diagonal(&held);
         system.add(0, &held, &-(held * bias));
         for (row, pair) in windows.windows(2).enumerate() {
-            let tilt = TILT_RAD_PER_M * (pair[1].path_m - pair[0].path_m) + TILT_RAD;
+            let path_m = pair[1].path_m - pair[0].path_m;
+            let tilt = self.drift * (TILT_RAD_PER_M * path_m + TILT_RAD);
             let walk = BIAS_WALK * (pair[1].time_s - pair[0].time_s).sqrt();
             let [tilt, walk] = [tilt.powi(-2), walk.powi(-2)];
             let information =
@@ -338,11 +361,12 @@ impl Ups {
             let turn = (self.turns[row + 1] * self.turns[row].inverse()).scaled_axis();
             let bias = self.biases[row + 1] - self.biases[row];
             let change = Vector6::new(turn.x, turn.y, turn.z, bias.x, bias.y, bias.z);
+            cost += change.dot(&(information * change));
             system.add(row, &information, &(information * change));
             system.add(row + 1, &information, &-(information * change));
             system.add_off_diagonal(row, row + 1, &-information);
         }
-        system
+        (cost, system)
     }
 
     /// Standard deviation of the direction up in the middle of the drive [rad].

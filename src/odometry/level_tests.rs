@@ -170,6 +170,25 @@ fn over_3700_m_height_and_tilt_do_not_drift_with_a_consumers_accelerometer() {
 }
 
 #[test]
+fn an_odometry_that_does_not_drift_keeps_its_shape() {
+    let truth = truth(370.0);
+    for errors in [NONE, CONSUMER] {
+        let samples = measured(&truth, &errors);
+        let (_, odometry, times_s) = scans(&truth, false);
+        let found = level(&odometry, &times_s, &samples, &calibration()).unwrap();
+        let middle = odometry.len() / 2;
+        let level_from_odom = found.poses[middle] * odometry[middle].inverse();
+        let bent_m = (odometry.iter().zip(&found.poses)).map(|(odometry, found)| {
+            let moved = level_from_odom * odometry;
+            (moved.translation.vector - found.translation.vector).norm()
+        });
+        let bent_m = bent_m.fold(0.0, f64::max);
+        eprintln!("bent by {bent_m} m over 3.7 km");
+        assert!(bent_m < 0.1, "{bent_m}");
+    }
+}
+
+#[test]
 fn a_straight_drive_does_not_tell_a_bias_from_a_tilt_and_says_so() {
     let steady: Vec<Pose3> = (0..6000)
         .map(|step| Pose3::translation(0.1 * f64::from(step), 0.0, 0.0))
