@@ -73,6 +73,15 @@ impl Rotation {
         }
     }
 
+    /// The same in the opposite direction.
+    pub(crate) fn reversed(self) -> Self {
+        let direction = match self.direction {
+            RotationDirection::Clockwise => RotationDirection::CounterClockwise,
+            RotationDirection::CounterClockwise => RotationDirection::Clockwise,
+        };
+        Self { direction, ..self }
+    }
+
     /// Time of each point from its azimuth, zero in the middle of the revolution [s].
     pub(crate) fn point_times(&self, points: &[Vec3]) -> Vec<f32> {
         let sense = self.direction.sense() as f32;

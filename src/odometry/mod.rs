@@ -67,7 +67,7 @@ pub use timing::TimingError;
 pub use trajectory::{InertialEstimate, Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
 pub(crate) use pose_check::{GivenPoses, check_poses};
-pub(crate) use timing::{TimingComparison, compare_timings};
+pub(crate) use timing::{TimingComparison, compare_timings, fits_best};
 
 #[cfg(test)]
 mod gyroscope_tests;

@@ -49,19 +49,9 @@ pub fn compare_timings(
     period_s: f64,
     config: &OdometryConfig,
 ) -> Result<TimingComparison, TimingError> {
-    config.validate()?;
-    // With wrong times no pose fits as it should; the residuals are compared.
-    let config = &OdometryConfig {
-        min_common_share: 0.0,
-        ..config.clone()
-    };
-    let runs = Runs { scans, config };
+    let runs = Runs::new(scans, config)?;
     if let Some(period_s) = period_of_order(scans, period_s) {
-        let candidates = [None, Some(PointTiming::Order { period_s })];
-        let residual = |candidate: &Option<PointTiming>| runs.mean_residual(*candidate);
-        let residuals: Result<Vec<f64>, _> = candidates.par_iter().map(residual).collect();
-        let residuals_m = candidates.into_iter().zip(residuals?).collect();
-        return Ok(TimingComparison::decided(residuals_m));
+        return runs.compared(vec![None, Some(PointTiming::Order { period_s })]);
     }
     let order = scans.first().and_then(FiringOrder::of);
     let first = |direction| Rotation {
@@ -99,6 +89,36 @@ pub fn compare_timings(
     let rotations: Result<Vec<_>, TimingError> = coarse?.par_iter().map(fitted).collect();
     let residuals_m = [(None, none_m)].into_iter().chain(rotations?).collect();
     Ok(TimingComparison::decided(residuals_m))
+}
+
+/// Whether known times of points, or none, clearly fit best: better than none and the opposite direction, than both directions
+/// from the rear, or than the order of the points. Then no other start of the revolution has to be compared.
+pub fn fits_best(
+    timing: Option<PointTiming>,
+    scans: &[Scan],
+    period_s: f64,
+    config: &OdometryConfig,
+) -> Result<bool, TimingError> {
+    let from_rear = |direction| {
+        Some(PointTiming::Rotation(Rotation {
+            direction,
+            period_s,
+            start_rad: PI,
+        }))
+    };
+    let others = match (timing, period_of_order(scans, period_s)) {
+        (Some(PointTiming::Rotation(rotation)), _) => {
+            vec![None, Some(PointTiming::Rotation(rotation.reversed()))]
+        }
+        (Some(PointTiming::Order { .. }), _) => vec![None],
+        (None, Some(period_s)) => vec![Some(PointTiming::Order { period_s })],
+        (None, None) => vec![
+            from_rear(RotationDirection::Clockwise),
+            from_rear(RotationDirection::CounterClockwise),
+        ],
+    };
+    let candidates = [vec![timing], others].concat();
+    Ok(Runs::new(scans, config)?.compared(candidates)?.best == Some(0))
 }
 
 impl TimingComparison {
@@ -143,13 +163,33 @@ fn period_of_order(scans: &[Scan], interval_s: f64) -> Option<f64> {
 /// Runs of the odometry over the same scans.
 struct Runs<'a> {
     scans: &'a [Scan],
-    config: &'a OdometryConfig,
+    config: OdometryConfig,
 }
 
 /// A rotation and its mean residual [m].
 type Fitted = (Rotation, f64);
 
-impl Runs<'_> {
+impl<'a> Runs<'a> {
+    fn new(scans: &'a [Scan], config: &OdometryConfig) -> Result<Self, TimingError> {
+        config.validate()?;
+        // With wrong times no pose fits as it should; the residuals are compared.
+        let config = OdometryConfig {
+            min_common_share: 0.0,
+            ..config.clone()
+        };
+        Ok(Self { scans, config })
+    }
+
+    fn compared(
+        &self,
+        candidates: Vec<Option<PointTiming>>,
+    ) -> Result<TimingComparison, TimingError> {
+        let residual = |candidate: &Option<PointTiming>| self.mean_residual(*candidate);
+        let residuals: Result<Vec<f64>, _> = candidates.par_iter().map(residual).collect();
+        let residuals_m = candidates.into_iter().zip(residuals?).collect();
+        Ok(TimingComparison::decided(residuals_m))
+    }
+
     /// The start of the revolution with the least residual among a first one and those by quarters of a turn from it. Points
     /// between a wrong start and the right one are off by a whole period.
     fn best_quarter(&self, first: Rotation) -> Result<Fitted, TimingError> {
@@ -183,13 +223,18 @@ impl Runs<'_> {
         rotations.par_iter().map(residual).collect()
     }
 
-    /// Mean residual of the registered scans; infinite if there are none [m].
+    /// Mean residual of the registered scans; infinite if there are none [m]. Large scans are thinned to every third point, fifth
+    /// and so on: odd steps pass through all beams.
     fn mean_residual(&self, candidate: Option<PointTiming>) -> Result<f64, TimingError> {
+        /// Least number of points that are left.
+        const POINTS: usize = 30_000;
         let mut odometer = Odometer::new(self.config.clone())?;
         let (mut sum_m, mut count) = (0.0, 0);
         for scan in self.scans {
             let mut scan = scan.clone();
             scan.times_s = candidate.map_or_else(Vec::new, |timing| timing.point_times(&scan));
+            let step = (scan.len() / POINTS).saturating_sub(1) / 2 * 2 + 1;
+            let scan = scan.every(step);
             if let Some(residual_m) = odometer.step(&scan)?.residual_m {
                 sum_m += residual_m;
                 count += 1;

@@ -9,7 +9,7 @@ use super::mounting::{self, Surroundings};
 use super::{Sensor, columns, own_car, projection, raw, rotation};
 use crate::geometry::wrap_angle;
 use crate::lidar::{LidarModel, PERIOD_S, PointTiming, Scan};
-use crate::odometry::{OdometryConfig, TimingComparison, TimingError, compare_timings};
+use crate::odometry::{OdometryConfig, TimingComparison, TimingError, compare_timings, fits_best};
 use crate::recording::{Frame, Recording, RecordingError};
 
 /// Number of scans from which a sensor is inferred.
@@ -317,10 +317,16 @@ fn warn_of_contradiction(
 ) -> Result<(), SensorError> {
     /// Starts of the revolution that are nearer are the same [rad].
     const SAME_START_RAD: f64 = 0.5;
-    let Some(compared) = timings_of_recording(recording)? else {
+    let scans = timing_scans(recording)?;
+    if !show_times(&scans) {
         return Ok(());
-    };
-    let configured = configured.timing(PERIOD_S);
+    }
+    let period_s = period_s(recording).unwrap_or(PERIOD_S);
+    let (configured, config) = (configured.timing(period_s), OdometryConfig::default());
+    if fits_best(configured, &scans, period_s, &config)? {
+        return Ok(());
+    }
+    let compared = compare_timings(&scans, period_s, &config)?;
     let is_same = |found: PointTiming, configured: PointTiming| match (found, configured) {
         (PointTiming::Rotation(found), PointTiming::Rotation(configured)) => {
             let apart_rad = wrap_angle(found.start_rad - configured.start_rad).abs();
@@ -363,6 +369,12 @@ fn residuals_in_words(compared: &TimingComparison) -> String {
 
 /// Compares the times of points by the distances between successive scans nearest the middle of a recording.
 fn timings_of_recording(recording: &Recording) -> Result<Option<TimingComparison>, SensorError> {
+    let scans = timing_scans(recording)?;
+    timings_of(&scans, period_s(recording).unwrap_or(PERIOD_S))
+}
+
+/// The successive scans nearest the middle of a recording; none if all are far apart.
+fn timing_scans(recording: &Recording) -> Result<Vec<Scan>, SensorError> {
     let frames = &recording.frames;
     let middle = frames.len().saturating_sub(TIMING_SCANS) / 2;
     let is_dense =
@@ -371,23 +383,26 @@ fn timings_of_recording(recording: &Recording) -> Result<Option<TimingComparison
         .windows(TIMING_SCANS.clamp(1, frames.len().max(1)))
         .enumerate();
     let dense = runs.filter(|(_, run)| is_dense(run));
-    let Some((_, run)) = dense.min_by_key(|(first, _)| first.abs_diff(middle)) else {
-        return Ok(None);
-    };
-    let scans: Vec<Scan> = run.iter().map(Frame::read).collect::<Result<_, _>>()?;
-    timings_of(&scans, period_s(recording).unwrap_or(PERIOD_S))
+    let nearest = dense.min_by_key(|(first, _)| first.abs_diff(middle));
+    let run = nearest.map_or_else(Default::default, |(_, run)| run);
+    Ok(run.iter().map(Frame::read).collect::<Result<_, _>>()?)
 }
 
-/// Compares the times of points by the distances between consecutive scans; `None` if the data have times, or if
-/// the scans are too few or too far apart.
+/// Compares the times of points by the distances between consecutive scans; `None` if these do not show them.
 fn timings_of(scans: &[Scan], period_s: f64) -> Result<Option<TimingComparison>, SensorError> {
-    let times_s: Vec<f64> = scans.iter().filter_map(|scan| scan.time_s).collect();
-    let are_timed = scans.iter().any(|scan| !scan.times_s.is_empty());
-    if are_timed || scans.len() < TIMING_SCANS / 2 || !are_dense(&times_s) {
+    if !show_times(scans) {
         return Ok(None);
     }
     let config = OdometryConfig::default();
     Ok(Some(compare_timings(scans, period_s, &config)?))
+}
+
+/// Whether consecutive scans may show the times of their points: the data have none, and the scans are enough and near each
+/// other.
+fn show_times(scans: &[Scan]) -> bool {
+    let times_s: Vec<f64> = scans.iter().filter_map(|scan| scan.time_s).collect();
+    let are_timed = scans.iter().any(|scan| !scan.times_s.is_empty());
+    !are_timed && scans.len() >= TIMING_SCANS / 2 && are_dense(&times_s)
 }
 
 /// Whether a sensor moves evenly between scans.
