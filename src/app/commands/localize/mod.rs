@@ -33,6 +33,15 @@ pub struct DriveArgs {
     #[arg(long = "odometry", alias = "odom", value_name = "FILE")]
     pub odometry_file: Option<FilePath>,
 
+    /// Inertial sensor whose rates predict rotations and compensate scans: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
+    #[arg(long = "imu", value_name = "FILE")]
+    pub imu_file: Option<FilePath>,
+
+    /// Positions of a GNSS receiver, a start in a map with a place on the Earth: sentences of NMEA, rows of time, latitude,
+    /// longitude and height, a folder oxts, or a topic of the bag; sets the key `gnss_file`.
+    #[arg(long = "gnss", value_name = "SOURCE")]
+    pub gnss_file: Option<FilePath>,
+
     /// True poses of the recording for the report; sets the key `pose_file`.
     #[arg(long = "truth", value_name = "FILE")]
     pub pose_file: Option<FilePath>,
@@ -67,15 +76,6 @@ pub struct LocalizeArgs {
     #[arg(long, value_name = "X,Y,HEADING", value_parser = start_pose, allow_hyphen_values = true)]
     #[serde(rename = "initial_pose")]
     pub start: Option<[f64; 3]>,
-
-    /// Inertial sensor whose rates predict rotations and compensate scans: a table of times, rates and forces, a folder oxts, or a topic of the bag; sets the key `imu_file`.
-    #[arg(long = "imu", value_name = "FILE")]
-    pub imu_file: Option<FilePath>,
-
-    /// Positions of a GNSS receiver, a start in a map with a place on the Earth: sentences of NMEA, rows of time, latitude,
-    /// longitude and height, a folder oxts, or a topic of the bag; sets the key `gnss_file`.
-    #[arg(long = "gnss", value_name = "SOURCE")]
-    pub gnss_file: Option<FilePath>,
 
     /// Odometry, true poses and result.
     #[command(flatten)]

@@ -39,6 +39,16 @@ pub fn check(config: &LocalizationConfig) -> Result<()> {
             file.display()
         );
     }
+    let sensors = [
+        ("imu_file", &config.inertial.imu_file),
+        ("gnss_file", &config.gnss.gnss_file),
+    ];
+    if let Some((key, Some(file))) = sensors.into_iter().find(|(_, file)| file.is_some()) {
+        bail!(
+            "{key} is {}, but it is read with the scans of a recording (--replay) only; set it to null",
+            file.display()
+        );
+    }
     Ok(())
 }
 
