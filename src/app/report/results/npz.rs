@@ -210,11 +210,13 @@ pub fn write_npy<T: AutoSerialize>(
     shape: &[usize],
     numbers: impl IntoIterator<Item = T>,
 ) -> io::Result<()> {
+    /// Of a million frames hundreds of megabytes are written when a command is stopped [bytes].
+    const BUFFER: usize = 1 << 20;
     let shape: Vec<u64> = shape.iter().map(|&extent| extent as u64).collect();
     let mut array = npyz::WriteOptions::new()
         .default_dtype()
         .shape(&shape)
-        .writer(BufWriter::new(writer))
+        .writer(BufWriter::with_capacity(BUFFER, writer))
         .begin_nd()?;
     array.extend(numbers)?;
     array.finish()
