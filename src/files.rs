@@ -7,7 +7,7 @@
 //! replaced the folder while the program ran. On Linux files are opened relative to the folder that was claimed, so that
 //! this holds between a check and a write, too.
 
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, BufWriter, Read as _, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -95,6 +95,55 @@ impl AtomicFile {
         check_claimed(&self.path)?;
         let persisted = self.temporary.persist(&self.place.path);
         persisted.map(drop).map_err(|failed| failed.error)
+    }
+}
+
+/// A file that grows under a name of its own, under which it stays if the process is killed, and is renamed once it is complete. It is
+/// locked, so that one that a killed process left is known by being unlocked.
+pub struct GrowingFile {
+    path: PathBuf,
+    file: File,
+    unfinished: Place,
+    place: Place,
+}
+
+impl GrowingFile {
+    /// Creates the file at `unfinished`, in the folder of `path`, which must exist, and replaces one that nobody writes.
+    pub fn create(path: &Path, unfinished: &Path) -> io::Result<Self> {
+        let (place, unfinished) = (Place::of(path)?, Place::of(unfinished)?);
+        if let Ok(left) = File::open(&unfinished.path) {
+            let is_written = matches!(left.try_lock(), Err(TryLockError::WouldBlock));
+            if is_written {
+                return Err(io::Error::other("another process is writing there"));
+            }
+            fs::remove_file(&unfinished.path)?;
+        }
+        // Through no link.
+        let file = (File::options().write(true).create_new(true)).open(&unfinished.path)?;
+        // Some file systems have no locks.
+        let _ = file.try_lock();
+        Ok(Self {
+            path: path.to_owned(),
+            file,
+            unfinished,
+            place,
+        })
+    }
+
+    /// The file.
+    pub fn file(&self) -> &File {
+        &self.file
+    }
+
+    /// Renames the file to its final path.
+    pub fn persist(self) -> io::Result<()> {
+        check_claimed(&self.path)?;
+        fs::rename(&self.unfinished.path, &self.place.path)
+    }
+
+    /// Removes the file.
+    pub fn remove(self) -> io::Result<()> {
+        fs::remove_file(&self.unfinished.path)
     }
 }
 

@@ -258,6 +258,67 @@ fn a_log_that_is_written_on_the_way_has_the_messages_that_export_writes_of_the_r
     again.fails_with(&["run.mcap exists; add --force"]);
 }
 
+#[cfg(unix)]
+#[test]
+fn a_log_of_a_process_that_is_killed_has_the_frames_until_then_and_is_not_replaced_unasked() {
+    use std::process::{Command, Stdio};
+    const UNFINISHED: &str = "run.unfinished.mcap";
+
+    let recording = street(12);
+    // The program waits for the scan of a pipe.
+    let scan = recording.path("velodyne/000008.bin");
+    let bytes = common::replace_by_pipe(&scan);
+    let mut program = Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"))
+        .args(["live", "localization.yml", "--backend=cpu"])
+        .args(["--replay=velodyne", "--rate=1000", "--queue=1000"])
+        .arg("--record=run.mcap")
+        .current_dir(recording.folder())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let log = recording.path(UNFINISHED);
+    common::wait_for_scans(&log, 8);
+    // SIGKILL.
+    program.kill().unwrap();
+    program.wait().unwrap();
+    let left = common::messages_in(&log);
+    for topic in ["/estimate", "/numbers", "/particles", "/scan", "/tf"] {
+        assert_eq!(left[topic], 8, "{left:?}");
+    }
+    assert!(left["/map"] == 1 && left["/state"] >= 2, "{left:?}");
+    assert!(!recording.path("run.mcap").exists());
+
+    fs::remove_file(&scan).unwrap();
+    fs::write(&scan, bytes).unwrap();
+    let again = || patient(&recording).with("--record=run.mcap");
+    let part = "run.unfinished.mcap exists, the log of a run that did not end; move it";
+    again().fails_with(&[part]);
+    assert_eq!(common::messages_in(&log), left);
+    again().with("--force").succeeds();
+    assert!(!log.exists());
+    assert_eq!(messages(&recording, "run.mcap")["/scan"].len(), 12);
+    // One of somebody else is kept.
+    fs::remove_file(recording.path(".fpmcl")).unwrap();
+    fs::write(&log, "of the user").unwrap();
+    again()
+        .with("--force")
+        .fails_with(&["was not written by fpmcl"]);
+    assert_eq!(fs::read(&log).unwrap(), b"of the user");
+}
+
+#[test]
+fn a_log_is_no_input_and_leaves_nothing_where_the_drive_does_not_begin() {
+    let recording = street(3);
+    let call = patient(&recording).with("--record=map.ply").with("--force");
+    call.fails_with(&["map.ply would be replaced, but it is an input (map_file)"]);
+    fs::write(recording.path("map.ply"), "ply").unwrap();
+    let call = patient(&recording).with("--record=run.mcap");
+    call.fails_with(&["map.ply"]);
+    for log in ["run.mcap", "run.unfinished.mcap"] {
+        assert!(!recording.path(log).exists(), "{log}");
+    }
+}
+
 #[test]
 fn a_sensor_that_stalls_is_reported_and_the_run_goes_on_when_it_sends_again() {
     let recording = street(12);

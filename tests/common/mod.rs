@@ -7,8 +7,11 @@ pub mod picture;
 #[path = "../../src/skips_for_tests.rs"]
 pub mod skips;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use assert_cmd::Command;
 use tempfile::TempDir;
@@ -212,6 +215,44 @@ pub fn real_recording(name: &str) -> Option<PathBuf> {
 #[track_caller]
 pub fn json(path: &Path) -> serde_json::Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
+}
+
+/// Number of messages of each topic of a log, up to where it ends.
+pub fn messages_in(log: &Path) -> BTreeMap<String, usize> {
+    let mut counts = BTreeMap::new();
+    let log = fs::read(log).unwrap_or_default();
+    let options = mcap::read::Options::IgnoreEndMagic.into();
+    let messages = mcap::MessageStream::new_with_options(&log, options);
+    for message in messages.into_iter().flatten().map_while(Result::ok) {
+        *counts.entry(message.channel.topic.clone()).or_default() += 1;
+    }
+    counts
+}
+
+/// Waits until a log that grows has a number of scans.
+#[track_caller]
+pub fn wait_for_scans(log: &Path, scans: usize) {
+    /// Time limit for a log that does not come.
+    const TIMEOUT: Duration = Duration::from_secs(120);
+    let begin = Instant::now();
+    loop {
+        let messages = messages_in(log);
+        if messages.get("/scan") == Some(&scans) {
+            return;
+        }
+        assert!(begin.elapsed() < TIMEOUT, "{messages:?}");
+        thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Replaces a scan by a named pipe, at which the program waits for the test; returns its content.
+#[cfg(unix)]
+pub fn replace_by_pipe(scan: &Path) -> Vec<u8> {
+    let bytes = fs::read(scan).unwrap();
+    fs::remove_file(scan).unwrap();
+    let made = std::process::Command::new("mkfifo").arg(scan).status();
+    assert!(made.unwrap().success());
+    bytes
 }
 
 /// An interpreter of Python with modules: that of `FPMCL_PYTHON`, of an environment of `.ci/run`, or of the system.

@@ -29,7 +29,7 @@ use crate::map::files::mesh_file;
 use crate::recording::{Frame, scan_files};
 
 /// First bytes of the files.
-const MCAP: &[u8] = b"\x89MCAP0\r\n";
+pub const MCAP: &[u8] = b"\x89MCAP0\r\n";
 const GLB: &[u8] = b"glTF";
 const GEOJSON: &[u8] = b"{";
 

@@ -7,8 +7,9 @@ mod robot;
 mod ros2;
 
 use std::net::{IpAddr, SocketAddr};
+use std::path::Path;
 
-use anyhow::{Result, bail};
+use anyhow::{Result, bail, ensure};
 use clap::Args;
 use serde::{Serialize, Serializer};
 use serde_json::json;
@@ -17,7 +18,7 @@ use self::driving::Drive;
 use self::replay::replay;
 use self::robot::Robot;
 use self::ros2::arguments::Ros2Args;
-use super::export::{self, ExportArgs};
+use super::export::MCAP;
 use super::localize::opened::{Opened, open, open_driving};
 use super::localize::tracking::start;
 use super::localize::{DriveArgs, Recorded, run_with, start_pose};
@@ -25,11 +26,11 @@ use super::motion_source::MotionSource;
 use crate::app::report::Report;
 #[cfg(feature = "viewer")]
 use crate::app::report::export::Viewer;
-use crate::app::report::export::{McapFile, Sinks};
+use crate::app::report::export::{McapFile, Sinks, unfinished_log};
 use crate::app::run::arguments::yaml;
-use crate::app::run::{ConfigArgs, Context, RecordingArgs, RunArgs};
+use crate::app::run::{Claims, ConfigArgs, Context, Outputs, RecordingArgs, RunArgs};
 use crate::app::settings::LocalizationConfig;
-use crate::file_path::FilePath;
+use crate::file_path::{FilePath, text_of};
 use crate::localization::Start;
 
 /// Arguments of `live`.
@@ -179,11 +180,8 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
         Some(LiveStart::Last) => last_pose::read(config)?,
         _ => None,
     };
-    let log = args.record.as_deref().map(|path| {
-        let map = &config.map_input.map_file;
-        ExportArgs::log_of(&config.result_path, map, path, config.output.force)
-    });
-    let claimed = log.map(|log| export::check(&log, context)).transpose()?;
+    let log = args.record.as_deref();
+    let claims = log.map(|log| claim_log(log, config, context)).transpose()?;
     let sinks = sinks(args)?;
     let open = if topic.is_some() { open_driving } else { open };
     let opened = open(config, &[last_pose::FILE], context);
@@ -215,12 +213,38 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
         )
     };
     let report = opened.and_then(|opened| run_with(opened, context, localize));
-    for (mut claims, path) in claimed.into_iter().flatten() {
-        if path.exists() {
-            claims.finish(&path)?;
-        }
+    if let (Some(mut claims), Some(log)) = (claims, log)
+        && log.exists()
+    {
+        claims.finish(log)?;
     }
     report
+}
+
+/// Checks and claims a log and the file in which it grows. What a killed process left there is replaced with `force` only, as a log is.
+fn claim_log(log: &Path, config: &LocalizationConfig, context: &Context) -> Result<Claims> {
+    let unfinished = unfinished_log(log);
+    let inputs = [
+        ("result_path", config.result_path.as_path()),
+        ("map_file", &config.map_input.map_file),
+        ("scan_folder", &config.recording.scan_folder),
+    ];
+    let outputs = Outputs {
+        key: "--record",
+        main: log,
+        magic: Some(MCAP),
+        names: vec![text_of(Path::new(unfinished.file_name().unwrap_or_default())).into_owned()],
+        inputs: inputs.into_iter().chain(context.input()).collect(),
+        force: config.output.force,
+    };
+    let claims = outputs.prepare()?;
+    let is_left = std::fs::metadata(&unfinished).is_ok_and(|found| found.len() > 0);
+    ensure!(
+        config.output.force || !is_left,
+        "{} exists, the log of a run that did not end; move it, or add --force to replace it",
+        unfinished.display()
+    );
+    Ok(claims)
 }
 
 /// Requires that the clouds of a topic can be localized.

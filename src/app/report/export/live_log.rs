@@ -3,8 +3,8 @@
 //! `/tf` is sent only while the pose is believed; each change of the `/state` has its reason; `/numbers` has latency and dropped
 //! scans in addition. They are encoded in a thread of their own: neither a slow disk nor a large map slows the localization.
 
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::time::Duration;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use serde_json::json;
@@ -23,6 +23,9 @@ use crate::localization::Estimate;
 
 /// Frames that may wait until they are encoded: those of three seconds of most sensors.
 const MOST_WAITING: usize = 32;
+
+/// Time after which what was sent is kept, also if the process is killed.
+const FLUSH: Duration = Duration::from_secs(1);
 
 /// A frame that was localized.
 pub struct LiveFrame {
@@ -112,13 +115,21 @@ impl LiveLogWriter {
             let stamp = nanoseconds(first_s);
             sinks.send("/map", stamp, &map_scene(mesh, stamp)?)?;
             send_state(sinks, first_s, Reason::NoScan)?;
-            for known in &self.waiting {
-                match known {
-                    Known::Frame(frame) => send_frame(sinks, *frame)?,
-                    Known::State { time_s, reason } => send_state(sinks, time_s, reason)?,
+            sinks.flush()?;
+            let mut flushed = Instant::now();
+            loop {
+                if flushed.elapsed() >= FLUSH {
+                    sinks.flush()?;
+                    flushed = Instant::now();
+                }
+                let wait = FLUSH.saturating_sub(flushed.elapsed());
+                match self.waiting.recv_timeout(wait) {
+                    Ok(Known::Frame(frame)) => send_frame(sinks, *frame)?,
+                    Ok(Known::State { time_s, reason }) => send_state(sinks, time_s, reason)?,
+                    Err(RecvTimeoutError::Timeout) => {}
+                    Err(RecvTimeoutError::Disconnected) => return sinks.finish(),
                 }
             }
-            sinks.finish()
         };
         if let Err(error) = send() {
             tracing::warn!("the log ends: {error:#}");

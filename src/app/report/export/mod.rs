@@ -14,6 +14,6 @@ pub mod tiles;
 pub use glb::{Model, Ribbon};
 pub use live_log::{LiveFrame, LiveLog, live_log};
 pub use log::{MOST_POINTS, RunLog, write_mcap};
-pub use sinks::{McapFile, Sinks};
+pub use sinks::{McapFile, Sinks, unfinished_log};
 #[cfg(feature = "viewer")]
 pub use viewer::Viewer;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufWriter, Seek, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
 use foxglove::{Encode, Schema};
@@ -11,7 +11,7 @@ use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
 use serde_json::Value;
 
-use crate::files::AtomicFile;
+use crate::files::GrowingFile;
 
 /// An encoded message.
 pub struct Message<'a> {
@@ -30,6 +30,11 @@ pub struct Message<'a> {
 pub trait MessageSink {
     /// Takes a message.
     fn write(&mut self, message: &Message) -> Result<()>;
+
+    /// Keeps what was written, also if the process is killed.
+    fn flush(&mut self) -> Result<()> {
+        Ok(())
+    }
 
     /// Completes what was written.
     fn finish(&mut self) -> Result<()>;
@@ -78,8 +83,10 @@ impl<W: Write + Seek> McapSink<W> {
     pub fn new(writer: W) -> Result<Self> {
         let options = WriteOptions::new()
             .compression(None)
-            // One entry per chunk stays in memory, for the index at the end: 1 MB per hour of large scans.
+            // One entry per chunk stays in memory, for the index at the end: 1 MB per hour.
             .chunk_size(Some(1 << 22))
+            // A chunk is written once it is complete, with its length: readers of a log that ends early rely on that.
+            .disable_seeking(true)
             .library(concat!("fpmcl ", env!("CARGO_PKG_VERSION")));
         Ok(Self {
             writer: options.create(writer)?,
@@ -118,23 +125,33 @@ impl<W: Write + Seek> MessageSink for McapSink<W> {
         Ok(self.writer.write_to_known_channel(&header, data)?)
     }
 
+    fn flush(&mut self) -> Result<()> {
+        Ok(self.writer.flush()?)
+    }
+
     fn finish(&mut self) -> Result<()> {
         self.writer.finish().context("cannot finish the log")?;
         Ok(())
     }
 }
 
-/// A log that replaces a file once it is complete.
+/// A log that replaces a file once it is complete. Until then it is next to it, in [`unfinished_log`], where it stays if the process is
+/// killed or the disk is full: whole chunks, without an index.
 pub struct McapFile {
     log: McapSink<BufWriter<File>>,
-    file: Option<AtomicFile>,
+    file: Option<GrowingFile>,
+}
+
+/// The file in which a log grows: `run.unfinished.mcap` for `run.mcap`.
+pub fn unfinished_log(path: &Path) -> PathBuf {
+    path.with_extension("unfinished.mcap")
 }
 
 impl McapFile {
     /// Begins a file.
     pub fn create(path: &Path) -> Result<Self> {
         let create = || {
-            let file = AtomicFile::create(path)?;
+            let file = GrowingFile::create(path, &unfinished_log(path))?;
             let log = McapSink::new(BufWriter::new(file.file().try_clone()?))?;
             let file = Some(file);
             anyhow::Ok(Self { log, file })
@@ -148,12 +165,27 @@ impl MessageSink for McapFile {
         self.log.write(message)
     }
 
+    fn flush(&mut self) -> Result<()> {
+        self.log.flush()
+    }
+
     fn finish(&mut self) -> Result<()> {
-        if let Some(file) = self.file.take() {
-            self.log.finish()?;
-            file.persist()?;
+        self.log.finish()?;
+        match self.file.take() {
+            Some(file) => Ok(file.persist()?),
+            None => Ok(()),
         }
-        Ok(())
+    }
+}
+
+impl Drop for McapFile {
+    /// A log without a message is nothing that is worth keeping.
+    fn drop(&mut self) {
+        if let Some(file) = self.file.take()
+            && self.log.sequence == 0
+        {
+            let _ = file.remove();
+        }
     }
 }
 
@@ -187,6 +219,11 @@ impl Sinks {
 impl MessageSink for Sinks {
     fn write(&mut self, message: &Message) -> Result<()> {
         self.retain(|sink| sink.write(message));
+        Ok(())
+    }
+
+    fn flush(&mut self) -> Result<()> {
+        self.retain(|sink| sink.flush());
         Ok(())
     }
 
