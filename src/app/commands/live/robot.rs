@@ -15,8 +15,8 @@ pub type ArrivedFrame = (Frame, Scan);
 pub struct MeasuredPose {
     /// Pose of the frame that the odometry measures: `p_odom = odom_from_child * p_child`.
     pub odom_from_child: Pose3,
-    /// The lidar on it, as far as it is known by now.
-    pub child_from_lidar: Pose3,
+    /// The lidar on it at that time; `None` if it is not known by now.
+    pub child_from_lidar: Option<Pose3>,
 }
 
 impl MeasuredPose {
@@ -27,7 +27,13 @@ impl MeasuredPose {
         const FASTEST: f64 = 100.0;
         let moved = earlier.odom_from_child.inverse() * self.odom_from_child;
         let is_possible = moved.translation.vector.norm() <= FASTEST * duration_s;
-        is_possible.then(|| self.child_from_lidar.inverse() * moved * self.child_from_lidar)
+        let [before, now] = match (earlier.child_from_lidar, self.child_from_lidar) {
+            // The lidar may move on the robot.
+            (Some(before), Some(now)) => [before, now],
+            // A mounting that becomes known is no motion.
+            (_, known) => [known.unwrap_or_default(); 2],
+        };
+        is_possible.then(|| before.inverse() * moved * now)
     }
 }
 
@@ -64,18 +70,25 @@ mod tests {
     #[test]
     fn a_mounting_that_becomes_known_and_a_reset_of_the_odometry_are_no_motion() {
         let step = Pose3::translation(0.5, 0.0, 0.0);
-        let pose = |odom_from_child: Pose3, child_from_lidar: Pose3| MeasuredPose {
+        let pose = |odom_from_child: Pose3, child_from_lidar: Option<Pose3>| MeasuredPose {
             odom_from_child,
             child_from_lidar,
         };
-        let first = pose(Pose3::translation(40.0, 7.0, 0.0), Pose3::identity());
+        let first = pose(Pose3::translation(40.0, 7.0, 0.0), None);
         let mounted = pose(
             first.odom_from_child * step,
-            Pose3::translation(1.0, 0.0, 2.0),
+            Some(Pose3::translation(1.0, 0.0, 2.0)),
         );
         let moved = mounted.since(&first, 0.1).unwrap();
         assert_relative_eq!(moved, step, epsilon = 1e-12);
         let reset = pose(step, mounted.child_from_lidar);
         assert_eq!(reset.since(&mounted, 0.1), None);
+        // A mast that rises is one.
+        let risen = pose(
+            mounted.odom_from_child * step,
+            Some(Pose3::translation(1.0, 0.0, 2.25)),
+        );
+        let moved = risen.since(&mounted, 0.1).unwrap();
+        assert_relative_eq!(moved, Pose3::translation(0.5, 0.0, 0.25), epsilon = 1e-12);
     }
 }

@@ -6,6 +6,8 @@ mod cdr;
 #[cfg(feature = "ros2")]
 mod drive;
 #[cfg(feature = "ros2")]
+mod frames;
+#[cfg(feature = "ros2")]
 mod node;
 #[cfg(feature = "ros2")]
 mod pose_buffer;

@@ -1,7 +1,8 @@
 //! Messages that the node publishes: pose, odometry, transform, diagnostics, and the map once.
 //!
 //! The transform is that of REP-105 (Meeussen, *Coordinate Frames for Mobile Platforms*, 2010): from the map to the frame of the
-//! odometry where somebody publishes the robot in it, else to the robot; never both, and only while tracking or coasting.
+//! odometry where somebody publishes the robot in it, else to the robot: to the topmost frame above the robot, as a frame has one
+//! parent; and only while tracking or coasting.
 
 use std::time::{Duration, Instant};
 
@@ -128,7 +129,11 @@ impl<'a> Publisher<'a> {
 
     fn publish_pose(&self, estimate: &Estimate, place: &Place) {
         let (map, stamp_ns) = (self.shared.map_frame.as_str(), place.moment_ns);
-        let lidar_from_child = place.child_from_lidar.inverse();
+        // A lidar on a mast whose transform is late.
+        let Some(child_from_lidar) = place.child_from_lidar else {
+            return;
+        };
+        let lidar_from_child = child_from_lidar.inverse();
         let map_from_child = estimate.map_from_lidar * lidar_from_child;
         let lever = map_from_child.translation.vector - estimate.map_from_lidar.translation.vector;
         let covariance = covariance_of_child(&estimate.covariance, &lever);
@@ -143,18 +148,18 @@ impl<'a> Publisher<'a> {
             .twist(linear, angular)
             .covariance(&Matrix6::zeros());
         self.odometry.send(odometry);
-        let (child, transform) = match &place.odom_from_child {
-            Some((odom, Some(pose))) => (odom, map_from_child * pose.inverse()),
-            Some((_, None)) => return,
-            // A driver may name no frame.
-            None if place.child.is_empty() => return,
-            None => {
-                let ahead = motion.map_or_else(Pose3::identity, |it| it.after(self.tolerance_s));
-                (&place.child, map_from_child * ahead)
-            }
+        // A driver may name no frame.
+        let (Some(top_from_child), false) = (place.top.pose, place.top_frame.is_empty()) else {
+            return;
         };
+        let ahead = match &motion {
+            Some(motion) if !place.top.is_moving => motion.after(self.tolerance_s),
+            _ => Pose3::identity(),
+        };
+        let transform = map_from_child * ahead * top_from_child.inverse();
         let stamp_ns = stamp_ns.saturating_add((1e9 * self.tolerance_s) as u64);
-        let message = Cdr::default().u32(1).header(stamp_ns, map).text(child);
+        let message = Cdr::default().u32(1).header(stamp_ns, map);
+        let message = message.text(&place.top_frame);
         self.transforms.send(message.pose(&transform));
     }
 

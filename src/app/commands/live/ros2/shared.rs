@@ -3,16 +3,13 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use super::frames::{FrameTree, Relation};
 use super::pose_buffer::PoseBuffer;
 use crate::app::commands::live::robot::MeasuredPose;
 use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::localization::Start;
 use crate::localization::initialization::{StartDistribution, StartSpread};
 use crate::recording::FramePose;
-use crate::recording::bags::transform_between;
-
-/// Number of static transforms that are kept: those of a robot with many sensors.
-const MOST_TRANSFORMS: usize = 1000;
 
 /// Number of clouds whose exact moments are kept.
 const MOST_MOMENTS: usize = 2000;
@@ -36,15 +33,13 @@ pub struct Shared {
 struct Known {
     /// Frame of the clouds.
     lidar_frame: Option<String>,
-    /// Transforms that do not change, one of each child.
-    static_transforms: Vec<FramePose>,
+    /// The frames of the robot below that of the map.
+    frames: FrameTree,
+    /// The frame above the robot that was reported.
+    reported_top: Option<String>,
     /// Poses of the topic of odometry, and the frame whose poses they are.
     odometry: PoseBuffer,
     odometry_child: String,
-    /// The frame that the robot moves in by /tf, and the poses of the robot or of the lidar in it.
-    odom_frame: Option<String>,
-    odom_from_moving: PoseBuffer,
-    moving_frame: String,
     proposal: Option<(Pose3, [f64; 2])>,
     /// Numbers of clouds and their moments [ns].
     moments: VecDeque<(usize, u64)>,
@@ -55,11 +50,12 @@ struct Known {
 pub struct Place {
     /// The frame of the robot where it is joined to the lidar, else that of the lidar.
     pub child: String,
-    /// `p_child = child_from_lidar * p_lidar`.
-    pub child_from_lidar: Pose3,
-    /// The frame of the odometry, and where that has the child; the latter is `None` while it is not known. The whole is `None` if
-    /// nobody publishes it.
-    pub odom_from_child: Option<(String, Option<Pose3>)>,
+    /// `p_child = child_from_lidar * p_lidar`; `None` while a transform between them that moves is not known.
+    pub child_from_lidar: Option<Pose3>,
+    /// The topmost frame above the child, that of the odometry where somebody publishes it; the child itself if nothing is above.
+    pub top_frame: String,
+    /// How the child is in it.
+    pub top: Relation,
     /// The moment of the scan [ns].
     pub moment_ns: u64,
 }
@@ -93,41 +89,33 @@ impl Shared {
     /// Takes transforms that do not change.
     pub fn static_transforms(&self, transforms: Vec<FramePose>) {
         let mut known = self.known();
-        let known = &mut known.static_transforms;
-        for transform in transforms {
-            match known.iter().position(|it| it.child == transform.child) {
-                Some(before) => known[before] = transform,
-                None if known.len() < MOST_TRANSFORMS => known.push(transform),
-                None => {}
-            }
+        let below_map = |it: &FramePose| it.parent != self.map_frame;
+        for transform in transforms.into_iter().filter(below_map) {
+            known.frames.add_static(transform);
         }
     }
 
-    /// Takes transforms that change, of which one may be where the odometry has the robot. Those from the map are our own.
+    /// Takes transforms that change, of which some may be where the odometry has the robot, or the robot the lidar. Those from the map
+    /// are our own.
     pub fn transforms(&self, transforms: Vec<FramePose>) {
         let mut known = self.known();
-        for it in transforms {
-            // Those of wheels and doors move, too, and a lidar may be on a mast.
-            let carries_lidar =
-                |frame: &str| *frame == self.base_frame || known.lidar_in(frame).is_some();
-            if !carries_lidar(&it.child) || carries_lidar(&it.parent) || it.parent == self.map_frame
-            {
-                continue;
+        let Known {
+            frames,
+            lidar_frame,
+            odometry_child,
+            ..
+        } = &mut *known;
+        let lidar = lidar_frame.as_deref().unwrap_or_default();
+        let below: [&str; 3] = [lidar, &self.base_frame, odometry_child];
+        let mut left = transforms;
+        left.retain(|it| it.parent != self.map_frame);
+        // One may be above another that follows in the message.
+        loop {
+            let before = left.len();
+            left.retain(|it| !frames.add_moving(it, &below));
+            if left.len() == before {
+                break;
             }
-            let odom_frame = known.odom_frame.get_or_insert_with(|| {
-                tracing::info!(
-                    "{} moves in {}, to which the transform leads",
-                    it.child,
-                    it.parent
-                );
-                it.parent.clone()
-            });
-            // A robot moves in one frame of odometry.
-            if *odom_frame != it.parent {
-                continue;
-            }
-            known.moving_frame = it.child;
-            known.odom_from_moving.push(it.time_s, it.parent_from_child);
         }
     }
 
@@ -145,7 +133,10 @@ impl Shared {
         let mut known = self.known();
         let odom_from_child = known.odometry.at(time_s)?;
         let child = known.odometry_child.clone();
-        let child_from_lidar = known.lidar_in(&child);
+        let child_from_lidar = match known.lidar_in(&child, time_s) {
+            Some(relation) => Some(relation.pose?),
+            None => None,
+        };
         if child_from_lidar.is_none() && !known.has_warned_of_mounting {
             known.has_warned_of_mounting = true;
             let lidar = known.lidar_frame.as_deref().unwrap_or_default();
@@ -155,7 +146,7 @@ impl Shared {
         }
         Some(MeasuredPose {
             odom_from_child,
-            child_from_lidar: child_from_lidar.unwrap_or_default(),
+            child_from_lidar,
         })
     }
 
@@ -176,9 +167,12 @@ impl Shared {
     pub fn proposed(&self) -> Option<Start> {
         let mut known = self.known();
         // The mounting is known with the frame of the clouds.
-        known.lidar_frame.as_ref()?;
+        let time_s = 1e-9 * known.moments.back()?.1 as f64;
+        let base_from_lidar = match known.lidar_in(&self.base_frame, time_s) {
+            Some(relation) => relation.pose?,
+            None => Pose3::identity(),
+        };
         let (map_from_base, deviations) = known.proposal.take()?;
-        let base_from_lidar = known.lidar_in(&self.base_frame).unwrap_or_default();
         let limited = |k: usize| deviations[k].clamp(LEAST_DEVIATIONS[k], LARGEST_DEVIATIONS[k]);
         Some(Start::Pose {
             map_from_lidar: pose2_from_pose3(&(map_from_base * base_from_lidar)),
@@ -194,39 +188,40 @@ impl Shared {
 
     /// What is known at a cloud; `time_s` is its moment.
     pub fn place(&self, number: usize, time_s: f64) -> Option<Place> {
-        let known = self.known();
-        let lidar_frame = known.lidar_frame.clone()?;
-        let found = known.lidar_in(&self.base_frame);
-        let (child, child_from_lidar) = match found {
-            Some(base_from_lidar) => (self.base_frame.clone(), base_from_lidar),
-            None => (lidar_frame, Pose3::identity()),
+        let mut known = self.known();
+        let lidar = known.lidar_frame.clone()?;
+        let base = &self.base_frame;
+        let (child, child_from_lidar) = match known.lidar_in(base, time_s) {
+            Some(relation) => (base.clone(), relation.pose),
+            None => (lidar, Some(Pose3::identity())),
         };
-        let odom_from_child = known.odom_frame.clone().map(|odom| {
-            let moving_from_lidar = known.lidar_in(&known.moving_frame);
-            let odom_from_lidar = known.odom_from_moving.at(time_s).zip(moving_from_lidar);
-            let pose = odom_from_lidar.map(|(odom_from_moving, moving_from_lidar)| {
-                odom_from_moving * moving_from_lidar * child_from_lidar.inverse()
-            });
-            (odom, pose)
-        });
+        let (mut top_frame, mut top) = known.frames.top_above(&child, time_s);
+        let (above_base, of_base) = known.frames.top_above(base, time_s);
+        if child != *base && of_base.is_moving {
+            // The odometry is known, and the mounting not yet.
+            (top_frame, top.pose) = (above_base, None);
+        }
+        let top_frame = top_frame.to_owned();
+        if top_frame != child && known.reported_top.as_ref() != Some(&top_frame) {
+            tracing::info!("the transform leads from {} to {top_frame}", self.map_frame);
+            known.reported_top = Some(top_frame.clone());
+        }
         let moment = known.moments.iter().find(|it| it.0 == number);
         Some(Place {
             child,
             child_from_lidar,
-            odom_from_child,
+            top_frame,
+            top,
             moment_ns: moment.map_or((1e9 * time_s) as u64, |it| it.1),
         })
     }
 }
 
 impl Known {
-    /// `p_frame = frame_from_lidar * p_lidar`, where static transforms join the two.
-    fn lidar_in(&self, frame: &str) -> Option<Pose3> {
-        let lidar = self.lidar_frame.as_deref()?;
-        if frame == lidar {
-            return Some(Pose3::identity());
-        }
-        transform_between(&self.static_transforms, frame, lidar)
+    /// How the lidar is in a frame at a time [s]; `None` if no transforms join the two.
+    fn lidar_in(&self, frame: &str, time_s: f64) -> Option<Relation> {
+        self.frames
+            .between(frame, self.lidar_frame.as_deref()?, time_s)
     }
 }
 
@@ -267,16 +262,79 @@ mod tests {
             (place.child.as_str(), place.moment_ns),
             ("base_link", 5_000_000_001)
         );
-        assert_relative_eq!(place.child_from_lidar, Pose3::translation(1.0, 0.0, 0.0));
-        assert!(place.odom_from_child.is_none());
+        let mounting = Pose3::translation(1.0, 0.0, 0.0);
+        assert_eq!(place.child_from_lidar, Some(mounting));
+        assert_eq!(
+            (place.top_frame.as_str(), place.top.is_moving),
+            ("base_link", false)
+        );
         let alone = Shared::new("map", "base_link");
         assert!(alone.place(0, 5.0).is_none());
         alone.cloud(0, "lidar", 1);
         let place = alone.place(0, 5.0).unwrap();
         assert_eq!(
             (place.child, place.child_from_lidar),
-            ("lidar".to_owned(), Pose3::identity())
+            ("lidar".to_owned(), Some(Pose3::identity()))
         );
+        assert_eq!(place.top_frame, "lidar");
+    }
+
+    #[test]
+    fn the_transform_leads_to_the_topmost_frame_above_the_base() {
+        let shared = robot();
+        let footprint = transform("footprint", "base_link", 0.0, 0.5, 0.0);
+        shared.static_transforms(vec![
+            footprint,
+            transform("map", "footprint", 0.0, 9.0, 0.0),
+        ]);
+        let place = shared.place(3, 5.0).unwrap();
+        assert_eq!(
+            (place.child.as_str(), place.top_frame.as_str()),
+            ("base_link", "footprint")
+        );
+        let expected = Relation {
+            pose: Some(Pose3::translation(0.5, 0.0, 0.0)),
+            is_moving: false,
+        };
+        assert_eq!(place.top, expected);
+    }
+
+    #[test]
+    fn odometry_and_mounting_may_go_over_several_transforms_that_move() {
+        let shared = Shared::new("map", "base_link");
+        shared.cloud(3, "lidar", 5_000_000_000);
+        shared.static_transforms(vec![transform("mast", "lidar", 0.0, 1.0, 0.0)]);
+        for (time_s, moved_m) in [(4.9, 2.0), (5.1, 3.0)] {
+            // From the top, as a message may have them.
+            shared.transforms(vec![
+                transform("odom", "footprint", time_s, moved_m, 0.0),
+                transform("footprint", "base_link", time_s, 0.1 * moved_m, 0.0),
+                transform("base_link", "mast", time_s, 10.0 * moved_m, 0.0),
+            ]);
+            shared.odometry(vec![transform("odom", "footprint", time_s, moved_m, 0.0)]);
+        }
+        let x = |pose: Option<Pose3>| pose.unwrap().translation.x;
+        let place = shared.place(3, 5.0).unwrap();
+        assert_eq!(
+            (place.child.as_str(), place.top_frame.as_str()),
+            ("base_link", "odom")
+        );
+        assert_relative_eq!(x(place.child_from_lidar), 26.0, epsilon = 1e-9);
+        assert_relative_eq!(x(place.top.pose), 2.75, epsilon = 1e-9);
+        let measured = shared.measured(5.0).unwrap();
+        assert_relative_eq!(measured.odom_from_child.translation.x, 2.5, epsilon = 1e-9);
+        assert_relative_eq!(x(measured.child_from_lidar), 26.25, epsilon = 1e-9);
+        shared.propose(transform("map", "", 5.0, 7.0, 0.0), [0.5, 0.2]);
+        let Some(Start::Pose { map_from_lidar, .. }) = shared.proposed() else {
+            panic!("no pose");
+        };
+        assert_relative_eq!(map_from_lidar.translation.x, 33.0, epsilon = 1e-9);
+        // The mast is joined, and where it is now is not known.
+        shared.odometry(vec![transform("odom", "footprint", 5.3, 4.0, 0.0)]);
+        assert!(shared.measured(5.3).is_none());
+        let place = shared.place(3, 5.3).unwrap();
+        assert_eq!((place.child_from_lidar, place.top.pose), (None, None));
+        assert_eq!(place.top_frame, "odom");
     }
 
     #[test]
@@ -286,32 +344,43 @@ mod tests {
             transform("map", "base_link", 5.0, 9.0, 0.0),
             transform("odom", "wheel", 5.0, 9.0, 0.0),
         ]);
-        assert!(shared.place(3, 5.0).unwrap().odom_from_child.is_none());
+        assert_eq!(shared.place(3, 5.0).unwrap().top_frame, "base_link");
         shared.transforms(vec![
             transform("odom", "base_link", 4.9, 2.0, 0.0),
             transform("odom", "base_link", 5.1, 3.0, 0.0),
         ]);
-        let (frame, pose) = shared.place(3, 5.0).unwrap().odom_from_child.unwrap();
-        assert_eq!(frame, "odom");
+        let place = shared.place(3, 5.0).unwrap();
+        assert_eq!(place.top_frame, "odom");
         assert_relative_eq!(
-            pose.unwrap(),
+            place.top.pose.unwrap(),
             Pose3::translation(2.5, 0.0, 0.0),
             epsilon = 1e-12
         );
         let on_ground = robot();
         on_ground.static_transforms(vec![transform("footprint", "base_link", 0.0, 0.5, 0.0)]);
         on_ground.transforms(vec![transform("odom", "footprint", 5.0, 2.0, 0.0)]);
-        let (_, pose) = on_ground.place(3, 5.0).unwrap().odom_from_child.unwrap();
+        let place = on_ground.place(3, 5.0).unwrap();
         assert_relative_eq!(
-            pose.unwrap(),
+            place.top.pose.unwrap(),
             Pose3::translation(2.5, 0.0, 0.0),
             epsilon = 1e-12
         );
         // It is not known any more, which is not the same as that there is none.
-        assert!(matches!(
-            shared.place(3, 9.0).unwrap().odom_from_child,
-            Some((_, None))
-        ));
+        let place = shared.place(3, 9.0).unwrap();
+        assert_eq!((place.top_frame.as_str(), place.top.pose), ("odom", None));
+        // The lidar is not joined to the robot yet: it gets no second parent.
+        let early = Shared::new("map", "base_link");
+        early.cloud(0, "lidar", 1);
+        early.transforms(vec![transform("odom", "base_link", 5.0, 2.0, 0.0)]);
+        let place = early.place(0, 5.0).unwrap();
+        assert_eq!(
+            (
+                place.child.as_str(),
+                place.top_frame.as_str(),
+                place.top.pose
+            ),
+            ("lidar", "odom", None)
+        );
     }
 
     #[test]
@@ -320,7 +389,7 @@ mod tests {
         assert!(shared.measured(5.0).is_none());
         shared.odometry(vec![transform("odom", "base_link", 5.0, 2.0, 0.5)]);
         let pose = shared.measured(5.0).unwrap();
-        let odom_from_lidar = pose.odom_from_child * pose.child_from_lidar;
+        let odom_from_lidar = pose.odom_from_child * pose.child_from_lidar.unwrap();
         let x = 2.0 + 0.5_f64.cos();
         assert_relative_eq!(odom_from_lidar.translation.x, x, epsilon = 1e-12);
     }
