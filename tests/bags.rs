@@ -3,6 +3,8 @@
 #![cfg(feature = "bags")]
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
+#[path = "fuzzed/allocation.rs"]
+mod allocation;
 mod bag_writers;
 #[path = "../src/skips_for_tests.rs"]
 mod skips;
@@ -733,6 +735,57 @@ fn a_message_that_no_sensor_sends_is_refused_by_its_size() {
     let error = error_of_info(&path);
     let problem = "message 0 of /points is damaged: a record has 900000000 bytes";
     assert!(error.contains(problem), "{error}");
+}
+
+#[test]
+#[cfg(unix)]
+fn the_index_of_a_long_recording_is_small_and_within_the_budget_of_memory() {
+    const ROWS: usize = 300_000;
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("long.db3");
+    // Measurements of an inertial sensor; then as many transforms of a robot's joints, which are not read.
+    db3(&path, &recording(Kind::CdrLittle));
+    let database = rusqlite::Connection::open(&path).unwrap();
+    let sql = "PRAGMA synchronous = OFF; PRAGMA journal_mode = OFF;
+         INSERT INTO topics VALUES (100, '/imu', 'sensor_msgs/msg/Imu', 'cdr', ''),
+                                   (101, '/tf', 'tf2_msgs/msg/TFMessage', 'cdr', '');";
+    database.execute_batch(sql).unwrap();
+    let add = |topic: u32| {
+        let rows = "INSERT INTO messages (topic_id, timestamp, data) \
+             WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < ?2) \
+             SELECT ?1, ?3 + 1000000 * i, x'00' FROM n";
+        database
+            .execute(rows, (topic, ROWS as i64, START_NS as i64))
+            .unwrap();
+    };
+    add(101);
+    let of_transforms = allocation::peak_of(|| Bag::open(&path).unwrap()).1;
+    assert!(of_transforms < 1 << 20, "{of_transforms}");
+    add(100);
+    let (bag, of_both) = allocation::peak_of(|| Bag::open(&path).unwrap());
+    // 24 bytes each, in a vector that is replaced by one of twice its size.
+    assert!(of_both < 72 * ROWS + (1 << 20), "{of_both}");
+    let counts = ["/imu", "/tf"].map(|name| {
+        let topic = bag.topics().iter().find(|topic| topic.name == name);
+        topic.unwrap().count
+    });
+    assert_eq!(counts, [ROWS; 2]);
+
+    let info = |memory| {
+        let mut call = Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"));
+        let output = call.arg("info").arg(&path).arg(memory).output().unwrap();
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let error = info("--memory=0.01");
+    for part in [
+        "long.db3: the index of a bag would need 13.7 MiB of memory, more than the budget of 10.2 MiB",
+        "`ros2 bag convert`",
+        "--memory sets the budget",
+    ] {
+        assert!(error.contains(part), "{error}");
+    }
+    let error = info("--memory=0.1");
+    assert!(!error.contains("budget"), "{error}");
 }
 
 #[test]

@@ -11,6 +11,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use fpmcl::geometry::Pose3;
+use fpmcl::memory::MemoryBudget;
 use fpmcl::recording::{Recording, RecordingError, Selection};
 use nalgebra::{Matrix4, Translation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
@@ -186,7 +187,8 @@ impl DataSet {
 
     fn open(&self, layout: Option<&str>) -> Result<Recording, RecordingError> {
         let layout = layout.map(|name| name.parse().unwrap());
-        Recording::open_with(&self.path(), layout, self.topic, &Selection::default())
+        let (all, budget) = (Selection::default(), MemoryBudget::default());
+        Recording::open_with(&self.path(), layout, self.topic, &all, budget)
     }
 }
 

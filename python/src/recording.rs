@@ -8,6 +8,7 @@ use anyhow::anyhow;
 use fpmcl::geometry::{Pose3, pose_from_degrees};
 use fpmcl::lidar;
 use fpmcl::mapping::calibrated;
+use fpmcl::memory::MemoryBudget;
 use fpmcl::odometry::OdometryConfig;
 use fpmcl::recording::{self, Layout, Selection};
 use fpmcl::sensor::{self, MotionCompensation, SensorConfig};
@@ -324,8 +325,9 @@ pub fn read_recording(
         ..SensorConfig::default()
     };
     let (recording, sensor) = released(py, || {
+        let budget = MemoryBudget::default();
         let mut recording =
-            recording::Recording::open_with(&path, layout, topic.as_deref(), &selection)?;
+            recording::Recording::open_with(&path, layout, topic.as_deref(), &selection, budget)?;
         recording.body_from_lidar = body_from_lidar.map(pose_from_degrees);
         let recording = recording.with_elevation_bias(elevation_bias_deg.to_radians());
         let track = match &poses {

@@ -21,6 +21,7 @@ use crate::geometry::Pose3;
 use crate::georeference::GeodeticFixes;
 use crate::inertial::Imu;
 use crate::lidar::{PointTiming, Scan};
+use crate::memory::MemoryBudget;
 
 /// Revolutions per second of the sensor, for recordings without times.
 const SCANS_PER_SECOND: f64 = 10.0;
@@ -89,11 +90,13 @@ impl Recording {
     /// # Errors
     /// There are no scans, or their times do not ascend or cannot be read.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, RecordingError> {
-        Self::open_with(path.as_ref(), None, None, &Selection::default())
+        let all = Selection::default();
+        Self::open_with(path.as_ref(), None, None, &all, MemoryBudget::default())
     }
 
     /// Opens the selected frames of a recording in a layout, or in the one that its files show. Where it has scans of several
-    /// lidars or scenes, `topic` names one: a topic of a bag, a lidar of HeLiPR, or a scene of nuScenes.
+    /// lidars or scenes, `topic` names one: a topic of a bag, a lidar of HeLiPR, or a scene of nuScenes. The index of a bag
+    /// is within the budget.
     ///
     /// # Errors
     /// As [`open`](Self::open); the selection is empty, the recording is in another layout, or there is no such topic.
@@ -102,10 +105,13 @@ impl Recording {
         layout: Option<Layout>,
         topic: Option<&str>,
         selection: &Selection,
+        memory_budget: MemoryBudget,
     ) -> Result<Self, RecordingError> {
+        #[cfg(not(feature = "bags"))]
+        let _ = memory_budget;
         #[cfg(feature = "bags")]
         if is_bag(path) && layout.is_none_or(|layout| layout == Layout::Bag) {
-            return Self::open_bag(path, topic, selection);
+            return Self::open_bag(path, topic, selection, memory_budget);
         }
         let mut files = layouts::find(path, layout, topic)?;
         let listed = files.listed.take();
@@ -172,8 +178,9 @@ impl Recording {
         path: &Path,
         topic: Option<&str>,
         selection: &Selection,
+        memory_budget: MemoryBudget,
     ) -> Result<Self, RecordingError> {
-        let bag = Arc::new(Bag::open(path)?);
+        let bag = Arc::new(Bag::open_within(path, memory_budget)?);
         let topic: Arc<str> = bag.topic(TopicKind::Scans, topic)?.name.as_str().into();
         let times_s = bag.scan_times(&topic)?;
         let moment_s = bag.read_scan(&topic, 0)?.time_s;
@@ -502,7 +509,8 @@ mod tests {
     }
 
     fn open(folder: &Path, selection: &Selection) -> Result<Recording, RecordingError> {
-        Recording::open_with(folder, None, None, selection)?.with_own_poses()
+        let budget = MemoryBudget::default();
+        Recording::open_with(folder, None, None, selection, budget)?.with_own_poses()
     }
 
     fn numbers(recording: &Recording) -> Vec<usize> {

@@ -13,7 +13,7 @@ use crate::app::report::georeference::GeoreferenceReport;
 use crate::app::report::results::Value;
 use crate::app::report::{LocalizationResults, RunSummary};
 use crate::app::run::arguments::{settings_parser, yaml};
-use crate::app::run::{MachineArgs, Printed, RecordingArgs, gibibytes, input};
+use crate::app::run::{MachineArgs, Printed, RecordingArgs, gibibytes, input, memory};
 use crate::app::settings;
 use crate::evaluation::RangeMclRules;
 use crate::file_path::FilePath;
@@ -149,7 +149,8 @@ struct PosesInfo {
 
 fn recording(path: &Path, config: &InfoConfig) -> Result<Printed> {
     let topic = config.topic.as_deref();
-    let recording = Recording::open_with(path, config.layout, topic, &Selection::default())?;
+    let (all, budget) = (Selection::default(), memory::budget());
+    let recording = Recording::open_with(path, config.layout, topic, &all, budget)?;
     let frames = &recording.frames;
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
     let scans = spread_scans(&recording)?;

@@ -62,8 +62,13 @@ impl<'a> RecordingInputs<'a> {
     pub fn open(&self) -> Result<Recording> {
         let config = self.recording;
         let topic = config.topic.as_deref();
-        let mut recording =
-            Recording::open_with(&config.scan_folder, config.layout, topic, &config.frames)?;
+        let mut recording = Recording::open_with(
+            &config.scan_folder,
+            config.layout,
+            topic,
+            &config.frames,
+            memory::budget(),
+        )?;
         recording.body_from_lidar = self.poses.body_from_lidar();
         Ok(recording.with_elevation_bias(config.elevation_bias_deg.to_radians()))
     }

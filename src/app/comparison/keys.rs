@@ -21,7 +21,7 @@ use serde_json::Value;
 use super::plan::PlannedRun;
 use crate::app::run::artefact::hash::{hash_of_file, hash_of_recording, hash_of_texts};
 use crate::app::run::input::is_bag;
-use crate::app::run::version;
+use crate::app::run::{memory, version};
 use crate::app::settings::{PoseInputConfig, RecordingConfig};
 use crate::recording::{Recording, is_topic};
 use crate::simulation::SimulationConfig;
@@ -101,6 +101,7 @@ impl KeyCache {
                     config.layout,
                     config.topic.as_deref(),
                     &config.frames,
+                    memory::budget(),
                 )?)
             }),
             Input::Topic(name) => Ok(format!("{name:?}")),

@@ -50,11 +50,11 @@ impl Reader {
         }
     }
 
-    fn index(&mut self, number: usize) -> Result<Index, String> {
+    fn index(&mut self, empty: impl Fn() -> Index) -> Result<Index, String> {
         match self {
-            Self::Mcap(file) => mcap_file::index(file, number),
-            Self::Ros1(file) => ros1_file::index(file, number),
-            Self::Database(database) => database.index(number),
+            Self::Mcap(file) => mcap_file::index(file, empty),
+            Self::Ros1(file) => ros1_file::index(file, empty),
+            Self::Database(database) => database.index(empty()),
         }
     }
 
@@ -62,16 +62,16 @@ impl Reader {
         match (self, place) {
             (Self::Mcap(file), place) => file.message(&mcap_file::FORMAT, place),
             (Self::Ros1(file), place) => file.message(&ros1_file::FORMAT, place),
-            (Self::Database(database), Place::Row(row)) => database.message(row),
+            (Self::Database(database), Place::Record(row)) => database.message(row.cast_signed()),
             (Self::Database(_), _) => Err("has no such row".to_owned()),
         }
     }
 }
 
 impl BagFile {
-    /// Opens a file and reads its index. One that is compressed whole is decompressed into the folder of
+    /// Opens a file and reads its index into an empty one. One that is compressed whole is decompressed into the folder of
     /// temporary files.
-    pub fn open(path: &Path, number: usize) -> Result<(Self, Index), String> {
+    pub fn open(path: &Path, empty: impl Fn() -> Index) -> Result<(Self, Index), String> {
         let decompressed = if is_compressed(path) {
             Some(decompress_file(path)?)
         } else {
@@ -83,7 +83,7 @@ impl BagFile {
             readers: Mutex::default(),
         };
         let mut reader = file.reader()?;
-        let index = reader.index(number)?;
+        let index = reader.index(empty)?;
         file.readers().push(reader);
         Ok((file, index))
     }
@@ -106,7 +106,7 @@ impl BagFile {
     /// Reads a message.
     pub fn read(&self, message: &Message) -> Result<Vec<u8>, String> {
         let mut reader = self.reader()?;
-        let bytes = reader.message(message.place);
+        let bytes = reader.message(message.place());
         self.readers().push(reader);
         let bytes = bytes?;
         if bytes.starts_with(ZSTD) {

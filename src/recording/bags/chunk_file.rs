@@ -56,8 +56,7 @@ impl ChunkFile {
     pub fn message(&mut self, format: &ChunkFormat, place: Place) -> Result<Vec<u8>, String> {
         let (position, offset) = match place {
             Place::Chunk(position, offset) => (position, offset as usize),
-            Place::File(position) => return (format.message)(self.at(position)?),
-            Place::Row(_) => return Err(truncated()),
+            Place::Record(position) => return (format.message)(self.at(position)?),
         };
         let chunk = match self.last_chunk.take() {
             Some((last, chunk)) if last == position => chunk,

@@ -66,8 +66,8 @@ impl Database {
         Ok(Self { connection, counts })
     }
 
-    /// Reads the index of a file.
-    pub fn index(&self, number: usize) -> Result<Index, String> {
+    /// Reads the index of a file into an empty one.
+    pub fn index(&self, index: Index) -> Result<Index, String> {
         for table in ["topics", "messages"] {
             if !self.is_table(table).map_err(damaged)? {
                 return Err(format!(
@@ -75,7 +75,7 @@ impl Database {
                 ));
             }
         }
-        self.read_index(number).map_err(damaged)?
+        self.read_index(index).map_err(damaged)?
     }
 
     /// Whether a name is that of a table that has pages in the file, and no column that is computed.
@@ -91,8 +91,7 @@ impl Database {
         Ok(count(has_pages)? == 1 && count(computed)? == 0)
     }
 
-    fn read_index(&self, number: usize) -> Result<Result<Index, String>, Error> {
-        let mut index = Index::of_file(number);
+    fn read_index(&self, mut index: Index) -> Result<Result<Index, String>, Error> {
         let topics = "SELECT rowid, id, name, type, serialization_format FROM topics NOT INDEXED";
         let mut topics = self.connection.prepare(topics)?;
         let mut rows = topics.query([])?;
@@ -126,7 +125,7 @@ impl Database {
             }
             let topic = row.get::<_, i64>(1)?.cast_unsigned();
             let time_ns = row.get::<_, i64>(2)?.try_into().unwrap_or(0);
-            if let Err(problem) = index.add(topic, time_ns, Place::Row(place)) {
+            if let Err(problem) = index.add(topic, time_ns, Place::Record(place.cast_unsigned())) {
                 return Ok(Err(problem));
             }
         }

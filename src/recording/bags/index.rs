@@ -64,23 +64,66 @@ pub struct Topic {
     pub(super) serialization: Serialization,
     /// Whether its messages hold until the next one, as those of static transforms.
     pub(super) is_latched: bool,
-    /// Messages in the order of their times; empty if fpmcl does not read the type.
+    /// Messages in the order of their times; empty if fpmcl does not read them.
     pub(super) messages: Vec<Message>,
     pub(super) has_warned: AtomicBool,
 }
 
-/// A message in a bag.
+impl Topic {
+    /// Whether its messages are read: of trees of transforms, only those that do not change.
+    fn is_read(&self) -> bool {
+        let is_moving = self.content == Some(Content::TransformTree) && !self.is_latched;
+        self.content.is_some() && !is_moving
+    }
+}
+
+/// A message in a bag, of which there may be millions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Message {
     /// When it was logged [ns].
     pub time_ns: u64,
-    /// Index of its file.
-    pub file: usize,
-    /// Where it is in the file.
-    pub place: Place,
+    /// Position of its record, or of that of its chunk.
+    position: u64,
+    /// Position in the decompressed chunk, or [`NO_CHUNK`](Self::NO_CHUNK).
+    offset: u32,
+    file: u32,
 }
 
 impl Message {
+    const NO_CHUNK: u32 = u32::MAX;
+
+    /// Most memory of one in an index that grows or is sorted [bytes].
+    pub const MOST_BYTES: u64 = 2 * size_of::<Self>() as u64;
+
+    fn new(time_ns: u64, file: usize, place: Place) -> Self {
+        let (position, offset) = match place {
+            Place::Record(position) => (position, Self::NO_CHUNK),
+            // No chunk is so long that the last offset is in it.
+            Place::Chunk(position, offset) => {
+                (position, offset.min(u64::from(Self::NO_CHUNK - 1)) as u32)
+            }
+        };
+        Self {
+            time_ns,
+            position,
+            offset,
+            file: file as u32,
+        }
+    }
+
+    /// Index of its file.
+    pub fn file(&self) -> usize {
+        self.file as usize
+    }
+
+    /// Where it is in the file.
+    pub fn place(&self) -> Place {
+        match self.offset {
+            Self::NO_CHUNK => Place::Record(self.position),
+            offset => Place::Chunk(self.position, offset.into()),
+        }
+    }
+
     /// When it was logged [s].
     pub fn time_s(&self) -> f64 {
         1e-9 * self.time_ns as f64
@@ -90,12 +133,10 @@ impl Message {
 /// Where a message is in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// Position of its record.
-    File(u64),
+    /// Position of its record, or number of its row in a database.
+    Record(u64),
     /// Position of the record of its compressed chunk, and that of its record in the decompressed chunk.
     Chunk(u64, u64),
-    /// Its row in a database.
-    Row(i64),
 }
 
 /// What is known of a topic before its messages.
@@ -111,16 +152,21 @@ pub struct Connection {
 #[derive(Default)]
 pub struct Index {
     pub topics: Vec<Topic>,
+    /// Number of messages of topics that are read, in `topics` or not.
+    pub read: usize,
+    /// Largest number of these in `topics`.
+    most_messages: usize,
     file: usize,
     /// Topics of the numbers by which a file names them.
     connections: BTreeMap<u64, usize>,
 }
 
 impl Index {
-    /// An empty index of one file.
-    pub fn of_file(file: usize) -> Self {
+    /// An empty index of one file, which keeps at most a number of messages and counts the others.
+    pub fn of_file(file: usize, most_messages: usize) -> Self {
         Self {
             file,
+            most_messages,
             ..Self::default()
         }
     }
@@ -156,18 +202,17 @@ impl Index {
     pub fn add(&mut self, number: u64, time_ns: u64, place: Place) -> Result<(), String> {
         let topic = self.connections.get(&number);
         let topic = *topic.ok_or("is damaged: a message has no topic; copy it again")?;
-        let message = Message {
-            time_ns,
-            file: self.file,
-            place,
-        };
+        let message = Message::new(time_ns, self.file, place);
         let topic = &mut self.topics[topic];
         let time_s = message.time_s();
         let (first_s, last_s) = topic.span_s.unwrap_or((time_s, time_s));
         topic.span_s = Some((first_s.min(time_s), last_s.max(time_s)));
         topic.count += 1;
-        if topic.content.is_some() {
-            topic.messages.push(message);
+        if topic.is_read() {
+            self.read += 1;
+            if self.read <= self.most_messages {
+                topic.messages.push(message);
+            }
         }
         Ok(())
     }
@@ -179,6 +224,7 @@ impl Index {
 
     /// Adds the topics and messages of another file.
     pub fn append(&mut self, other: Self) {
+        self.read += other.read;
         for added in other.topics {
             let topic = self.topic(&Connection {
                 topic: added.name,
@@ -193,7 +239,11 @@ impl Index {
                 (Some(a), Some(b)) => Some((a.0.min(b.0), a.1.max(b.1))),
                 (a, b) => a.or(b),
             };
-            topic.messages.extend(added.messages);
+            if topic.messages.is_empty() {
+                topic.messages = added.messages;
+            } else {
+                topic.messages.extend(added.messages);
+            }
         }
     }
 }

@@ -37,17 +37,17 @@ const CHUNK_HEADER: u64 = 40;
 const FOOTER: u64 = HEAD + 20 + MAGIC.len() as u64;
 
 /// Reads the index of a file.
-pub fn index(file: &mut ChunkFile, number: usize) -> Result<Index, String> {
+pub fn index(file: &mut ChunkFile, empty: impl Fn() -> Index) -> Result<Index, String> {
     let magic = read_bytes(file.at(0)?, MAGIC.len() as u64);
     if magic.as_deref() != Ok(MAGIC) {
         return Err("is not an MCAP file".to_owned());
     }
-    from_summary(file, Index::of_file(number)).or_else(|problem| {
+    from_summary(file, empty()).or_else(|problem| {
         tracing::warn!(
             "{} {problem}; all of it is read for an index, `mcap recover` writes one",
             file.path.display()
         );
-        from_records(file, Index::of_file(number))
+        from_records(file, empty())
     })
 }
 
@@ -74,7 +74,7 @@ fn from_summary(file: &mut ChunkFile, index: Index) -> Result<Index, String> {
         match kind {
             op::CHUNK_INDEX => chunks.push(ChunkIndex::parse(body)?),
             op::STATISTICS => count = fields(body)?.u64()?,
-            _ => tables.add(kind, body, Place::Row(0))?,
+            _ => tables.add(kind, body, Place::Record(0))?,
         }
     }
     let index_lengths = chunks.iter().map(|chunk| chunk.index_length);
@@ -114,11 +114,11 @@ fn from_records(file: &mut ChunkFile, index: Index) -> Result<Index, String> {
             op::CHUNK => tables.add_records_of(file, position)?,
             op::MESSAGE => {
                 let header = read_bytes(&mut file.file, length.min(MESSAGE_HEADER as u64))?;
-                tables.add(kind, &header, Place::File(position))?;
+                tables.add(kind, &header, Place::Record(position))?;
             }
             op::SCHEMA | op::CHANNEL => {
                 let body = read_bytes(&mut file.file, length)?;
-                tables.add(kind, &body, Place::File(position))?;
+                tables.add(kind, &body, Place::Record(position))?;
             }
             op::DATA_END => break,
             _ => {}
@@ -184,7 +184,7 @@ impl Tables {
                 let place = if chunk.is_compressed {
                     Place::Chunk(chunk.position, offset)
                 } else {
-                    Place::File(data_at.saturating_add(offset))
+                    Place::Record(data_at.saturating_add(offset))
                 };
                 self.index.add(channel.into(), time_ns, place)?;
             }

@@ -1,7 +1,7 @@
 //! Bags, the recordings of ROS: `.mcap` and `.db3` of ROS 2, `.bag` of ROS 1, and folders with `metadata.yaml`
 //! of several such files.
 //!
-//! A bag that is opened has its index in memory, 40 bytes per message of the types that are read.
+//! A bag that is opened has its index in memory, 24 bytes per message of the topics that are read.
 //! Every message can then be read from every thread; a thread holds one decompressed chunk. The times of
 //! lists of messages are those at which they were logged, since the stamps are in the messages; scans and
 //! poses that are read have the times of their stamps.
@@ -21,6 +21,7 @@ mod ros1_file;
 mod transforms;
 
 use std::fmt;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
@@ -35,6 +36,7 @@ use crate::geometry::Pose3;
 use crate::georeference::GeodeticFixes;
 use crate::inertial::ImuSample;
 use crate::lidar::Scan;
+use crate::memory::MemoryBudget;
 use bag_file::BagFile;
 use fields::Fields;
 use index::{Content, Index, Message};
@@ -98,6 +100,10 @@ impl fmt::Debug for Bag {
     }
 }
 
+/// What to do about an index that is too large.
+const REMEDY: &str =
+    "keep the topics that are used, in shorter bags, with `ros2 bag convert` or `rosbag filter`";
+
 /// Names and types of topics.
 fn listed<'a>(topics: impl Iterator<Item = &'a Topic>) -> String {
     let names = topics.map(|topic| format!("{} ({})", topic.name, topic.message_type));
@@ -110,6 +116,14 @@ impl Bag {
     /// # Errors
     /// The file cannot be read, or is no bag.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
+        Self::open_within(path, MemoryBudget::default())
+    }
+
+    /// Opens a bag whose index is within a budget.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open); the index needs more memory.
+    pub fn open_within(path: &Path, budget: MemoryBudget) -> Result<Self, RecordingError> {
         let bad = |path: &Path, problem| RecordingError::BadBag {
             path: path.to_owned(),
             problem,
@@ -117,9 +131,15 @@ impl Bag {
         let mut files = Vec::new();
         let mut index = Index::default();
         for file in bag_file::paths(path).map_err(|problem| bad(path, problem))? {
-            let opened = BagFile::open(&file, files.len());
+            let most_messages = budget.bytes / Message::MOST_BYTES - index.read as u64;
+            let empty = || Index::of_file(files.len(), most_messages as usize);
+            let opened = BagFile::open(&file, empty);
             let (file, added) = opened.map_err(|problem| bad(&file, problem))?;
             index.append(added);
+            let bytes = Message::MOST_BYTES as f64 * index.read as f64;
+            budget
+                .require("the index of a bag", bytes, REMEDY)
+                .map_err(|error| RecordingError::read(&file.path)(io::Error::other(error)))?;
             files.push(file);
         }
         for topic in &mut index.topics {
@@ -331,12 +351,12 @@ impl Bag {
             let count = topic.messages.len();
             let message = topic.messages.get(number);
             let message = message.ok_or_else(|| format!("does not exist, there are {count}"))?;
-            let bytes = self.files[message.file].read(message)?;
+            let bytes = self.files[message.file()].read(message)?;
             parse(&bytes, message.time_s())
         };
         read().map_err(|problem| RecordingError::BadMessage {
             path: (topic.messages.get(number))
-                .map_or(&self.path, |message| &self.files[message.file].path)
+                .map_or(&self.path, |message| &self.files[message.file()].path)
                 .clone(),
             topic: topic.name.clone(),
             number,

@@ -75,7 +75,7 @@ fn field<'a>(mut header: &'a [u8], name: &str) -> Option<&'a [u8]> {
 }
 
 /// Reads the index of a file.
-pub fn index(file: &mut ChunkFile, number: usize) -> Result<Index, String> {
+pub fn index(file: &mut ChunkFile, empty: impl Fn() -> Index) -> Result<Index, String> {
     let magic = read_bytes(file.at(0)?, MAGIC.len() as u64);
     if magic.as_deref() != Ok(MAGIC) {
         return Err(
@@ -90,7 +90,7 @@ pub fn index(file: &mut ChunkFile, number: usize) -> Result<Index, String> {
                 .to_owned(),
         );
     }
-    let mut index = Index::of_file(number);
+    let mut index = empty();
     let mut chunks = Vec::new();
     let mut position = index_at;
     while position < file.length {
@@ -150,7 +150,7 @@ fn add_chunk(index: &mut Index, file: &mut ChunkFile, chunk_at: u64) -> Result<u
             let place = if is_compressed {
                 Place::Chunk(chunk_at, offset)
             } else {
-                Place::File(data_at + offset)
+                Place::Record(data_at + offset)
             };
             index.add(connection, 1_000_000_000 * seconds + nanoseconds, place)?;
         }

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 use clap::Args;
 
-use crate::app::run::MachineArgs;
 use crate::app::run::arguments::{is_config, require_input, settings_parser};
 use crate::app::run::input::is_bag;
 use crate::app::run::input::require_folder;
+use crate::app::run::{MachineArgs, memory};
 use crate::app::settings::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
 use crate::file_path::FilePath;
@@ -119,6 +119,7 @@ pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<LabelledSc
         config.recording.layout,
         config.recording.topic.as_deref(),
         &config.recording.frames,
+        memory::budget(),
     )?;
     let folder = &recording.files.scans;
     let frames = recording.frames.into_iter();
