@@ -149,21 +149,20 @@ impl TrajectoryMetrics {
 
     /// `None` if no trusted frames are left after the skipped ones.
     fn after_skipping(whole: &EvaluatedTrajectory, config: &MetricsConfig) -> Option<Self> {
-        let rows = whole.trusted_after(config.skip_frames);
-        let columns = whole.columns(&rows);
+        // What has an entry per frame is dropped before the next is computed: a run may have a million.
+        let convergence = {
+            let errors = planar_errors(whole.estimates, whole.ground_truth);
+            let driven_m = distances_m(whole.ground_truth);
+            (config.success).convergence(&errors, &driven_m, whole.times_s)
+        };
+        let columns = whole.columns(&whole.trusted_after(config.skip_frames));
         let counted = columns.as_trajectory();
-        let all_errors = planar_errors(whole.estimates, whole.ground_truth);
-        let all_distances_m = distances_m(whole.ground_truth);
-        let errors = &pick(&all_errors, &rows);
+        let relative = RelativeErrors::of(&counted);
+        let errors = &planar_errors(counted.estimates, counted.ground_truth);
         let driven_m = distances_m(counted.ground_truth);
         let column =
             |number: fn(&PlanarError) -> f64| -> Vec<f64> { errors.iter().map(number).collect() };
         let distance = column(PlanarError::distance_m);
-        let (estimates, truth) = (
-            level_poses(counted.estimates),
-            level_poses(counted.ground_truth),
-        );
-        let relative = relative_pose_error(&estimates, &truth);
         Some(Self {
             frames: errors.len(),
             skipped_frames: config.skip_frames,
@@ -175,13 +174,13 @@ impl TrajectoryMetrics {
             along: AxisError::of(&column(|error| error.along_m))?,
             across: AxisError::of(&column(|error| error.across_m))?,
             heading_rad: Summary::new(&column(|error| error.turn_rad))?,
-            convergence: (config.success).convergence(&all_errors, &all_distances_m, whole.times_s),
+            convergence,
             smoothness: Smoothness::of(&counted, errors),
             drift: slope(&driven_m, &distance),
             drift_m_per_s: counted.times_s.and_then(|times| slope(times, &distance)),
-            rpe_translation_m: relative.translation(),
-            rpe_rotation_rad: relative.rotation(),
-            segments: kitti_segment_errors(&estimates, &truth),
+            rpe_translation_m: relative.translation_m,
+            rpe_rotation_rad: relative.rotation_rad,
+            segments: relative.segments,
             runtime_s: (whole.runtimes_s)
                 .and_then(|all| Summary::new(all.get(config.skip_frames..)?)),
             first_runtime_s: whole.runtimes_s.and_then(|all| all.first().copied()),
@@ -272,6 +271,28 @@ impl Smoothness {
             mean_turn_rad: change.map(|(_, turn_rad)| turn_rad),
             mean_step_of_truth_m: mean_pose_change(trajectory.ground_truth)
                 .map(|(step_m, _)| step_m),
+        }
+    }
+}
+
+/// Errors of the motions between poses.
+struct RelativeErrors {
+    translation_m: Option<Summary>,
+    rotation_rad: Option<Summary>,
+    segments: Option<SegmentErrors>,
+}
+
+impl RelativeErrors {
+    fn of(trajectory: &EvaluatedTrajectory) -> Self {
+        let (estimates, truth) = (
+            level_poses(trajectory.estimates),
+            level_poses(trajectory.ground_truth),
+        );
+        let steps = relative_pose_error(&estimates, &truth);
+        Self {
+            translation_m: steps.translation(),
+            rotation_rad: steps.rotation(),
+            segments: kitti_segment_errors(&estimates, &truth),
         }
     }
 }

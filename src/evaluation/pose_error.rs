@@ -15,7 +15,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::statistics::{Summary, mean};
+use super::statistics::Summary;
 use crate::geometry::{Pose3, distances_m};
 
 /// Errors of poses or of pairs of poses.
@@ -95,13 +95,16 @@ pub struct SegmentErrors {
 impl SegmentErrors {
     /// The mean over all segments, as the KITTI benchmark averages; `None` without segments.
     pub(crate) fn mean_of<'a>(segments: impl IntoIterator<Item = &'a Segment>) -> Option<Self> {
-        let (translations, rotations): (Vec<f64>, Vec<f64>) = (segments.into_iter())
-            .map(|segment| (segment.translation, segment.rotation_rad_per_m))
-            .unzip();
-        Some(Self {
-            translation_percent: 100.0 * mean(&translations)?,
-            rotation_deg_per_m: mean(&rotations)?.to_degrees(),
-            segments: translations.len(),
+        let (mut translations, mut rotations, mut count) = (0.0, 0.0, 0);
+        for segment in segments {
+            translations += segment.translation;
+            rotations += segment.rotation_rad_per_m;
+            count += 1;
+        }
+        (count > 0).then(|| Self {
+            translation_percent: 100.0 * (translations / count as f64),
+            rotation_deg_per_m: (rotations / count as f64).to_degrees(),
+            segments: count,
         })
     }
 
@@ -121,8 +124,9 @@ pub fn segments(
     frame_step: usize,
 ) -> Vec<Segment> {
     let driven_m = distances_m(ground_truth);
-    let mut segments = Vec::new();
-    for first in (0..ground_truth.len()).step_by(frame_step.max(1)) {
+    let starts = (0..ground_truth.len()).step_by(frame_step.max(1));
+    let mut segments = Vec::with_capacity(starts.len() * lengths_m.len());
+    for first in starts {
         for &length_m in lengths_m {
             let end_m = driven_m[first] + length_m;
             let last = driven_m.partition_point(|&driven_m| driven_m < end_m);

@@ -78,6 +78,18 @@ impl SpatialMetrics {
             estimates.get(skip_frames..)?,
             ground_truth.get(skip_frames..)?,
         );
+        let mut by_length = Vec::new();
+        let mut mean_of_segments = |lengths_m: &[f64], frame_step| {
+            let all = segments(estimates, truth, lengths_m, frame_step);
+            by_length.extend(lengths_m.iter().filter_map(|&length_m| {
+                let of_length = all.iter().filter(|it| it.length_m == length_m);
+                let errors = SegmentErrors::mean_of(of_length)?;
+                Some(LengthErrors { length_m, errors })
+            }));
+            SegmentErrors::mean_of(&all)
+        };
+        let short_segments = mean_of_segments(&SHORT_LENGTHS_M, 1);
+        let kitti_segments = mean_of_segments(&KITTI_LENGTHS_M, KITTI_FRAME_STEP);
         let errors = absolute_pose_error(estimates, truth);
         let aligned_errors = rigid_alignment(estimates, truth)
             .map(|transform| absolute_pose_error(&aligned(&transform, estimates), truth));
@@ -85,14 +97,6 @@ impl SpatialMetrics {
         let heights_m: Vec<f64> = pairs
             .map(|(estimate, truth)| estimate.translation.z - truth.translation.z)
             .collect();
-        let short = segments(estimates, truth, &SHORT_LENGTHS_M, 1);
-        let kitti = segments(estimates, truth, &KITTI_LENGTHS_M, KITTI_FRAME_STEP);
-        let by_length = SHORT_LENGTHS_M.into_iter().chain(KITTI_LENGTHS_M);
-        let by_length = by_length.filter_map(|length_m| {
-            let segments = short.iter().chain(&kitti);
-            let errors = SegmentErrors::mean_of(segments.filter(|s| s.length_m == length_m))?;
-            Some(LengthErrors { length_m, errors })
-        });
         Some(Self {
             position_m: errors.translation()?,
             height_m: Summary::new(&heights_m)?,
@@ -103,9 +107,9 @@ impl SpatialMetrics {
             distance_m: *distances_m(truth).last()?,
             end_position_m: *errors.translations_m.last()?,
             end_rotation_rad: *errors.rotations_rad.last()?,
-            kitti_segments: SegmentErrors::mean_of(&kitti),
-            short_segments: SegmentErrors::mean_of(&short),
-            by_length: by_length.collect(),
+            kitti_segments,
+            short_segments,
+            by_length,
         })
     }
 

@@ -2,9 +2,9 @@
 
 use std::io::{self, Write};
 
-use serde_json::json;
+use serde::Serialize;
 
-use super::{Georeference, ProjectionError};
+use super::{Georeference, HeightReference, ProjectionError};
 use crate::geometry::StampedPose;
 
 /// Writes poses in the map as one feature: a line string, or several where poses between are missing, with the times of
@@ -25,23 +25,53 @@ pub fn write_geojson(
         .filter(|stretch| stretch.len() > 1)
         .map(|stretch| stretch.iter().map(|pose| pose.time_s).collect())
         .collect();
-    let (geometry, times_s) = match (lines.as_slice(), times_s.as_slice()) {
-        ([line], [times_s]) => (
-            json!({"type": "LineString", "coordinates": line}),
-            json!(times_s),
-        ),
-        _ => (
-            json!({"type": "MultiLineString", "coordinates": lines}),
-            json!(times_s),
-        ),
-    };
-    let feature = json!({
-        "type": "Feature",
-        "geometry": geometry,
-        "properties": {"times_s": times_s, "height_above": georeference.height_above},
-    });
-    serde_json::to_writer(&mut writer, &feature)?;
+    let height_above = georeference.height_above;
+    match (lines.as_slice(), times_s.as_slice()) {
+        ([line], [times_s]) => {
+            let feature = Feature::new("LineString", line, times_s, height_above);
+            serde_json::to_writer(&mut writer, &feature)?;
+        }
+        _ => {
+            let feature = Feature::new("MultiLineString", &lines, &times_s, height_above);
+            serde_json::to_writer(&mut writer, &feature)?;
+        }
+    }
     writeln!(writer)
+}
+
+#[derive(Serialize)]
+struct Feature<C, T> {
+    geometry: Geometry<C>,
+    properties: Properties<T>,
+    r#type: &'static str,
+}
+
+#[derive(Serialize)]
+struct Geometry<C> {
+    coordinates: C,
+    r#type: &'static str,
+}
+
+#[derive(Serialize)]
+struct Properties<T> {
+    height_above: HeightReference,
+    times_s: T,
+}
+
+impl<C, T> Feature<C, T> {
+    fn new(kind: &'static str, coordinates: C, times_s: T, height_above: HeightReference) -> Self {
+        Self {
+            geometry: Geometry {
+                coordinates,
+                r#type: kind,
+            },
+            properties: Properties {
+                height_above,
+                times_s,
+            },
+            r#type: "Feature",
+        }
+    }
 }
 
 /// Longitude and latitude to 0.1 mm [deg], and height to 1 mm [m].

@@ -115,7 +115,8 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         results = follow(config, &map, &sequence)?;
     }
     let sequence = frames_of(sequence, &results, config)?;
-    let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
+    let rules = RangeMclRules::default();
+    let estimates = results.estimates_or_particle_means(&rules)?.into_owned();
     let increments = increments(config, &sequence, &results)?;
     let starts = if is_trajectory {
         let [position_m, heading_deg] = config.uncertainty;

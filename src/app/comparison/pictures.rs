@@ -126,13 +126,13 @@ pub fn trajectories(
             .iter()
             .copied()
             .zip(planar_errors(&it.poses, &it.truth));
-        (it.name.as_str(), it.color, errors.collect())
+        (it.name.as_str(), it.color, errors)
     });
     let title = format!("{sequence}: errors over time");
     let errors = save_chart(
         &format!("errors_{sequence}.png"),
         &format!("Position and heading error over time ({seeds})"),
-        &error_chart(&title, first.time_name, &errors.collect::<Vec<_>>()),
+        &error_chart(&title, first.time_name, errors),
         layout,
     )?;
     Ok([paths, errors].into_iter().flatten().collect())

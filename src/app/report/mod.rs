@@ -16,3 +16,6 @@ pub mod plotting;
 
 pub use results::{LocalizationResults, Report, RunSummary, TrajectoryReport};
 pub use run_output::RunFiles;
+
+#[cfg(test)]
+mod memory_tests;

@@ -202,10 +202,10 @@ impl<'a> Trajectory<'a> {
                 if all && self.states.is_some() {
                     writeln!(file, "# {}", self.state(stretch[0]).word())?;
                 }
-                let poses = stretch
-                    .iter()
-                    .map(|&row| self.frames[row].stamped(self.poses[row]));
-                write_tum(&mut *file, &poses.collect::<Vec<_>>())?;
+                for &row in stretch {
+                    let pose = self.frames[row].stamped(self.poses[row]);
+                    write_tum(&mut *file, &[pose])?;
+                }
             }
             io::Result::Ok(())
         })?;

@@ -101,7 +101,8 @@ fn short_name(path: &str) -> String {
 impl RunPage<'_> {
     /// Writes `report.html` next to the result.
     pub fn write(&self) -> Result<()> {
-        output::write_text(&self.files.file("report.html"), &self.page()?.to_html())
+        let page = self.page()?;
+        output::write_file(&self.files.file("report.html"), |file| page.write(file))
     }
 
     fn page(&self) -> Result<Page> {
@@ -151,9 +152,8 @@ impl RunPage<'_> {
         let content = plots.join(INTERACTIVE);
         let mut elements = Vec::new();
         if content.exists() {
-            let json = fs::read_to_string(&content);
             elements.push(PageElement::Interactive {
-                json: json.with_context(|| format!("cannot read {}", content.display()))?,
+                content,
                 caption: "Path over the map, colored by error or state. Point at a frame: its scan is drawn where the estimate puts it. Wheel or pinch to zoom, drag to move, double click to see all.".to_owned(),
             });
         }

@@ -118,7 +118,8 @@ fn in_map(
         converge_thres: config.converge_thres,
         particle_select_ratio: config.particle_select_ratio,
     };
-    results.estimates = Some(results.estimates_or_particle_means(&rules)?.into());
+    let estimates = results.estimates_or_particle_means(&rules)?.into_owned();
+    results.estimates = Some(estimates.into());
     let alignment = config.alignment.unwrap_or(Alignment::None);
     note(&mut about, alignment);
     truth::align(&mut results, alignment)?;

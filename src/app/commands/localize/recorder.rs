@@ -1,5 +1,6 @@
 //! Results of localize, collected frame by frame.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -199,7 +200,7 @@ impl Run {
     }
 
     /// The localized frames.
-    pub fn frames(&self, opened: &Opened) -> Vec<Frame> {
+    pub fn frames<'a>(&self, opened: &'a Opened) -> Cow<'a, [Frame]> {
         if opened.is_driving() {
             let forgotten = Arc::<Scan>::default();
             let frame = |(&number, &time_s)| {
@@ -208,10 +209,14 @@ impl Run {
             let times_s = self.results.times_s.iter().flatten();
             return self.results.frames.iter().zip(times_s).map(frame).collect();
         }
-        let is_localized =
-            |frame: &&Frame| self.results.frames.binary_search(&frame.number).is_ok();
-        let frames = opened.recording.frames.iter();
-        frames.filter(is_localized).cloned().collect()
+        let (all, localized) = (&opened.recording.frames, &self.results.frames);
+        // Both ascend.
+        let first = all.get(..localized.len()).unwrap_or_default();
+        if first.last().map(|frame| frame.number) == localized.last().copied() {
+            return first.into();
+        }
+        let is_localized = |frame: &&Frame| localized.binary_search(&frame.number).is_ok();
+        all.iter().filter(is_localized).cloned().collect()
     }
 
     /// Number of frames to localize; of a robot, those that arrived.

@@ -2,16 +2,24 @@
 //!
 //! On a phone, wide tables scroll inside their own frame; in print, collapsed texts are expanded.
 
+use std::fmt;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::{Table, html};
 use crate::app::run::visible::visible;
+use crate::shared_bytes::SharedBytes;
 
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
 const INTERACTIVE_SCRIPT: &str = include_str!("interactive.js");
+
+/// Begins the content of an interactive path; no text does, as `<` is escaped.
+const CONTENT: &str = "<script type=\"application/json\">";
 
 /// One HTML file.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -53,8 +61,8 @@ pub enum PageElement {
     },
     /// Interactive path, whose content is JSON.
     Interactive {
-        /// Content.
-        json: String,
+        /// File of the content, which may be long.
+        content: PathBuf,
         /// Caption.
         caption: String,
     },
@@ -72,12 +80,28 @@ pub enum PageElement {
 }
 
 impl Page {
-    fn is_interactive(&self) -> bool {
-        let mut elements = self.sections.iter().flat_map(|section| &section.elements);
-        elements.any(|element| matches!(element, PageElement::Interactive { .. }))
+    fn contents(&self) -> impl Iterator<Item = &Path> {
+        let elements = self.sections.iter().flat_map(|section| &section.elements);
+        elements.filter_map(|element| match element {
+            PageElement::Interactive { content, .. } => Some(content.as_path()),
+            _ => None,
+        })
     }
 
-    /// Renders the file.
+    /// Writes the file, with the contents of interactive paths as they are read.
+    pub fn write(&self, out: &mut impl Write) -> io::Result<()> {
+        let html = self.to_html();
+        let mut parts = html.split(CONTENT);
+        out.write_all(parts.next().unwrap_or_default().as_bytes())?;
+        for (path, part) in self.contents().zip(parts) {
+            out.write_all(CONTENT.as_bytes())?;
+            write_content(path, out)?;
+            out.write_all(part.as_bytes())?;
+        }
+        Ok(())
+    }
+
+    /// Renders the file without the contents of interactive paths.
     pub fn to_html(&self) -> String {
         let page = html! {
             (DOCTYPE)
@@ -108,13 +132,29 @@ impl Page {
                         }
                     }
                     script { (PreEscaped(SCRIPT)) }
-                    @if self.is_interactive() { script { (PreEscaped(INTERACTIVE_SCRIPT)) } }
+                    @if self.contents().next().is_some() { script { (PreEscaped(INTERACTIVE_SCRIPT)) } }
                 }
             }
         };
         // Names from outside do not change the direction of the text or vanish in it.
         visible(&page.into_string()).into_owned()
     }
+}
+
+/// Writes the content of an interactive path so that no text of it ends the element.
+fn write_content(path: &Path, out: &mut impl Write) -> io::Result<()> {
+    let unreadable = |error: &dyn fmt::Display| {
+        io::Error::other(format!("cannot read {}: {error}", path.display()))
+    };
+    let bytes = SharedBytes::of_file(path).map_err(|error| unreadable(&error))?;
+    let text = str::from_utf8(&bytes).map_err(|error| unreadable(&error))?;
+    for (number, part) in text.split('<').enumerate() {
+        if number > 0 {
+            out.write_all(br"\u003c")?;
+        }
+        out.write_all(visible(part).as_bytes())?;
+    }
+    Ok(())
 }
 
 impl PageElement {
@@ -136,14 +176,13 @@ impl PageElement {
                     figcaption { (caption) }
                 }
             },
-            Self::Interactive { json, caption } => html! {
+            Self::Interactive { caption, .. } => html! {
                 figure.interactive {
                     canvas aria-label=(caption) {}
                     input type="range" min="0" value="0" aria-label="Frame";
                     output {}
                     figcaption { (caption) }
-                    // No text of the content ends the element.
-                    script type="application/json" { (PreEscaped(json.replace('<', "\\u003c"))) }
+                    (PreEscaped(CONTENT)) (PreEscaped("</script>"))
                 }
             },
             Self::CollapsedTable(table) => html! {

@@ -1,20 +1,22 @@
 //! Content of the interactive path of a page: the map from above and, for each frame, its pose, state, numbers
 //! and the outline of its scan. `interactive.js` of the page draws it.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context as _, Result};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use nalgebra::Matrix3;
+use serde::ser::SerializeMap as _;
+use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 
 use super::color::{Colormap, MCL, REFINED, Rgb, STATES, TRUTH};
 use super::map_image::MapImage;
 use crate::app::report::results::{LocalizationResults, RowLog};
 use crate::app::run::output;
+use crate::evaluation::PlanarError;
 use crate::evaluation::trust::Axes;
-use crate::evaluation::{PlanarError, planar_errors};
 use crate::geometry::Pose2;
 use crate::localization::State;
 
@@ -36,49 +38,79 @@ impl InteractivePath<'_> {
         output::write_file(path, |file| serde_json::to_writer(file, &content))
     }
 
-    fn content(&self) -> Result<Value> {
-        let results = self.results;
-        let best = results.refined.as_deref().unwrap_or(self.estimates);
-        let axes = |all: &[Matrix3<f64>]| -> Vec<f64> {
+    fn content(&self) -> Result<Content<'_>> {
+        let outlines = self.results.scan_outlines.as_ref();
+        Ok(Content {
+            path: self,
+            map: self.map.map(map_layer).transpose()?,
+            scans: outlines.map(encoded).transpose()?,
+        })
+    }
+}
+
+/// The content, whose numbers of frames are made when they are written.
+struct Content<'a> {
+    path: &'a InteractivePath<'a>,
+    map: Option<Value>,
+    scans: Option<Value>,
+}
+
+impl Serialize for Content<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let results = self.path.results;
+        let refined = results.refined.as_deref();
+        let best = refined.unwrap_or(self.path.estimates);
+        let errors = || {
+            let pairs = best.iter().zip(results.ground_truth.as_deref()?);
+            Some(pairs.map(|(pose, truth)| PlanarError::between(pose, truth)))
+        };
+        let error_cm = |it: PlanarError| rounded(100.0 * it.distance_m(), 100.0);
+        let heading_error_deg = |it: PlanarError| rounded(it.turn_rad.abs().to_degrees(), 1e4);
+        let sigmas_cm = (results.best_covariances()).map(|all| {
             let pairs = all.iter().zip(best);
-            pairs
-                .map(|(covariance, pose)| {
-                    rounded(100.0 * Axes::new(covariance, pose).long_m, 100.0)
-                })
-                .collect()
-        };
-        let errors = (results.ground_truth.as_ref()).map(|truth| planar_errors(best, truth));
-        let numbers = |value: fn(&PlanarError) -> f64, per_unit: f64| -> Option<Vec<f64>> {
-            let errors = errors.as_ref()?.iter();
-            Some(
-                errors
-                    .map(|error| rounded(value(error), per_unit))
-                    .collect(),
-            )
-        };
+            pairs.map(|(covariance, pose)| {
+                rounded(100.0 * Axes::new(covariance, pose).long_m, 100.0)
+            })
+        });
         let word = |&number: &u8| Some(State::from_number(number)?.word());
+        let colors = STATES.map(|(state, color)| (state.word(), css(color)));
+        let (name, color) = if refined.is_some() {
+            ("refined", REFINED)
+        } else {
+            ("MCL", MCL)
+        };
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("agreements", &results.agreements)?;
+        map.serialize_entry("color", &css(color))?;
+        let colormap = (0..10).map(|k| css(Colormap::Viridis.at(f64::from(k) / 9.0)));
+        map.serialize_entry("colormap", &colormap.collect::<Vec<_>>())?;
+        map.serialize_entry("errors_cm", &errors().map(|all| Items(all.map(error_cm))))?;
+        map.serialize_entry("frames", &results.frames)?;
+        let heading_errors_deg = errors().map(|all| Items(all.map(heading_error_deg)));
+        map.serialize_entry("heading_errors_deg", &heading_errors_deg)?;
+        map.serialize_entry("map", &self.map)?;
+        map.serialize_entry("name", name)?;
+        map.serialize_entry("places", &results.places)?;
+        map.serialize_entry("poses", &flat(best))?;
+        map.serialize_entry("scans", &self.scans)?;
+        map.serialize_entry("sigmas_cm", &sigmas_cm.map(Items))?;
+        map.serialize_entry("state_colors", &BTreeMap::from(colors))?;
         let states = results.states.as_ref();
-        let colors = STATES.map(|(state, color)| (state.word().to_owned(), css(color).into()));
-        Ok(json!({
-            "map": self.map.map(map_layer).transpose()?,
-            "frames": results.frames,
-            "times_s": results.recorded_times(),
-            "name": if results.refined.is_some() { "refined" } else { "MCL" },
-            "color": css(if results.refined.is_some() { REFINED } else { MCL }),
-            "poses": flat(best),
-            "trusted": results.best_trusted(),
-            "truth": results.ground_truth.as_deref().map(flat),
-            "truth_color": css(TRUTH),
-            "errors_cm": numbers(|error| 100.0 * error.distance_m(), 100.0),
-            "heading_errors_deg": numbers(|error| error.turn_rad.abs().to_degrees(), 1e4),
-            "sigmas_cm": results.best_covariances().map(axes),
-            "agreements": results.agreements,
-            "places": results.places,
-            "states": states.map(|all| all.iter().map(word).collect::<Vec<_>>()),
-            "state_colors": Value::Object(colors.into_iter().collect()),
-            "colormap": (0..10).map(|k| css(Colormap::Viridis.at(f64::from(k) / 9.0))).collect::<Vec<_>>(),
-            "scans": results.scan_outlines.as_ref().map(encoded).transpose()?,
-        }))
+        map.serialize_entry("states", &states.map(|all| Items(all.iter().map(word))))?;
+        map.serialize_entry("times_s", &results.recorded_times())?;
+        map.serialize_entry("trusted", &results.best_trusted())?;
+        map.serialize_entry("truth", &results.ground_truth.as_deref().map(flat))?;
+        map.serialize_entry("truth_color", &css(TRUTH))?;
+        map.end()
+    }
+}
+
+/// A sequence of items that are made when they are written.
+struct Items<I>(I);
+
+impl<I: Iterator<Item: Serialize> + Clone> Serialize for Items<I> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_seq(self.0.clone())
     }
 }
 
@@ -93,13 +125,13 @@ fn map_layer(map: &MapImage) -> Result<Value> {
 }
 
 /// x, y [m], heading [rad] of all poses.
-fn flat(poses: &[Pose2]) -> Vec<f64> {
+fn flat(poses: &[Pose2]) -> impl Serialize {
     let row = |pose: &Pose2| {
         let t = pose.translation;
         let heading_rad = rounded(pose.rotation.angle(), 1e5);
         [rounded(t.x, 1e4), rounded(t.y, 1e4), heading_rad]
     };
-    poses.iter().flat_map(row).collect()
+    Items(poses.iter().flat_map(row))
 }
 
 /// Number of points of each outline, and all of them as 16-bit integers, little-endian.
@@ -157,7 +189,7 @@ mod tests {
             estimates: &estimates,
             map: None,
         };
-        let content = content.content().unwrap();
+        let content = serde_json::to_value(content.content().unwrap()).unwrap();
         assert_eq!(content["poses"].as_array().unwrap().len(), 9);
         assert_eq!(content["errors_cm"], json!([2.0, 2.0, 2.0]));
         assert_eq!(content["states"], json!(["searching", "tracking", "lost"]));

@@ -237,10 +237,10 @@ fn the_run_of_range_mcl_on_kitti_07_is_drawn() {
     assert_picture(&path, &[(MCL, 1000), (TRUTH, 1000)]);
 
     let frames = (0..truth.len()).map(|frame| frame as f64);
-    let errors = frames.zip(planar_errors(&estimates, &truth)).collect();
+    let errors = frames.zip(planar_errors(&estimates, &truth));
     let path = gallery.path("errors_kitti07.png");
     let title = "KITTI 07, error of range-mcl";
-    let chart = error_chart(title, "frame", &[("MCL", MCL, errors)]);
+    let chart = error_chart(title, "frame", [("MCL", MCL, errors)]);
     chart.save(&path).unwrap();
     assert_picture(&path, &[(MCL, 1000)]);
 }
@@ -251,14 +251,14 @@ fn errors_are_drawn_for_both_trajectories() {
     let truth = street(400);
     let errors = |estimates: Vec<Pose2>| {
         let times = (0..400).map(|k| 0.1 * f64::from(k));
-        times.zip(planar_errors(&estimates, &truth)).collect()
+        times.zip(planar_errors(&estimates, &truth))
     };
     let path = gallery.path("errors.png");
     let trajectories = [
         ("MCL", MCL, errors(noisy(&truth, 0.5, 6))),
         ("refined", REFINED, errors(noisy(&truth, 0.1, 0))),
     ];
-    let chart = error_chart("Error over time", "time from the start [s]", &trajectories);
+    let chart = error_chart("Error over time", "time from the start [s]", trajectories);
     chart.save(&path).unwrap();
     assert_picture(&path, &[(MCL, 1000), (REFINED, 1000)]);
 }

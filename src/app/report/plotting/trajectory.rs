@@ -139,23 +139,24 @@ fn draw_ends(sheet: &Sheet, view: &View, poses: &[Pose2]) -> Result<()> {
     Ok(())
 }
 
-/// Name and color of a trajectory, and its errors over time or frame number.
-pub type NamedErrors<'a> = (&'a str, Rgb, Vec<(f64, PlanarError)>);
-
-/// Position and heading error of trajectories.
-pub fn error_chart(title: &str, x_name: &str, trajectories: &[NamedErrors]) -> LineChart {
-    let panel = |y_name: &str, value: fn(&PlanarError) -> f64| {
-        let series = trajectories.iter().map(|(name, color, errors)| {
-            let points = errors.iter().map(|(x, error)| (*x, value(error)));
-            Series::line(name, *color, points)
+/// Position and heading error of trajectories: name, color, and errors over time or frame number.
+pub fn error_chart<'a, E: IntoIterator<Item = (f64, PlanarError)>>(
+    title: &str,
+    x_name: &str,
+    trajectories: impl IntoIterator<Item = (&'a str, Rgb, E)>,
+) -> LineChart {
+    let series = trajectories.into_iter().map(|(name, color, errors)| {
+        let errors = errors.into_iter().map(|(x, error)| {
+            let heading_deg = error.turn_rad.abs().to_degrees();
+            ((x, 100.0 * error.distance_m()), (x, heading_deg))
         });
-        Panel::new(y_name, series)
-    };
+        let (position_cm, heading_deg): (Vec<_>, Vec<_>) = errors.unzip();
+        [position_cm, heading_deg].map(|points| Series::line(name, color, points))
+    });
+    let (position, heading): (Vec<_>, Vec<_>) = series.map(<(_, _)>::from).unzip();
     let panels = [
-        panel("position error [cm]", |error| 100.0 * error.distance_m()),
-        panel("heading error [deg]", |error| {
-            error.turn_rad.abs().to_degrees()
-        }),
+        Panel::new("position error [cm]", position),
+        Panel::new("heading error [deg]", heading),
     ];
     LineChart::new(title, x_name, panels)
 }
@@ -184,8 +185,13 @@ pub fn drift_chart(truth: &[Pose3], trajectories: &[NamedPoses]) -> LineChart {
                 .filter(|(_, is_trusted)| **is_trusted);
             poses.map(|(pose, _)| *pose).collect()
         };
-        let (of_estimates, of_truth) = (trusted_of(estimates), trusted_of(truth));
-        let moved = rigid_alignment(&of_estimates, &of_truth).map(|it| aligned(&it, estimates));
+        let (alignment, by_length) = {
+            let (of_estimates, of_truth) = (trusted_of(estimates), trusted_of(truth));
+            let metrics = SpatialMetrics::new(&of_estimates, &of_truth, 0);
+            let by_length = metrics.map(|it| it.by_length).unwrap_or_default();
+            (rigid_alignment(&of_estimates, &of_truth), by_length)
+        };
+        let moved = alignment.map(|it| aligned(&it, estimates));
         let label = format!("{name}, rigidly aligned");
         for (name, mark, poses) in [
             (name, Mark::Line, estimates),
@@ -206,8 +212,6 @@ pub fn drift_chart(truth: &[Pose3], trajectories: &[NamedPoses]) -> LineChart {
                 });
             }
         }
-        let by_length = SpatialMetrics::new(&of_estimates, &of_truth, 0).map(|it| it.by_length);
-        let by_length = by_length.unwrap_or_default();
         let values: [fn(&LengthErrors) -> f64; 2] = [
             |it| it.errors.translation_percent,
             |it| it.errors.rotation_deg_per_100_m(),

@@ -128,8 +128,14 @@ impl<T> Default for Column<T> {
 }
 
 impl<T: Pod> Clone for Column<T> {
+    /// A long column has its copy in a file, too.
     fn clone(&self) -> Self {
-        self.to_vec().into()
+        let mut copy = Self {
+            folder: self.folder.clone(),
+            items: Items::InMemory(Vec::new()),
+        };
+        self.iter().for_each(|&item| copy.push(item));
+        copy
     }
 }
 
@@ -264,6 +270,7 @@ mod tests {
         assert_eq!((column[7], column[10_000]), (pose(70), pose(3)));
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         let copy = column.clone();
+        assert!(matches!(copy.items, Items::InFile(..)));
         column[7] = pose(7);
         assert_eq!(copy[7], pose(70));
         assert_ne!(copy, column);

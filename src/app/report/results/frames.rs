@@ -9,7 +9,7 @@ use super::localization_results::LocalizationResults;
 use super::trusted::{trusted_distances_m, with_gaps};
 use crate::app::run::output;
 use crate::evaluation::trust::Axes;
-use crate::evaluation::{PlanarError, drift, planar_errors};
+use crate::evaluation::{PlanarError, drift};
 use crate::geometry::{Pose2, Pose3, distances_m};
 use crate::localization::State;
 
@@ -38,14 +38,6 @@ fn write_localization(
     let truth = results.ground_truth.as_deref();
     let refined = results.refined.as_deref();
     let covariances = results.covariances.as_deref();
-    let errors = |poses: Option<&[Pose2]>| Some(planar_errors(poses?, truth?));
-    let (mcl_errors, refined_errors) = (errors(Some(estimates)), errors(refined));
-    let axes: Option<Vec<Axes>> = covariances.map(|covariances| {
-        let pairs = covariances.iter().zip(estimates);
-        pairs
-            .map(|(covariance, pose)| Axes::new(covariance, pose))
-            .collect()
-    });
     let (trajectory, trusted) = (results.trajectory(estimates), results.trusted());
     let driven_m = truth.map_or_else(|| trusted_distances_m(&trajectory, &trusted), distances_m);
     let trajectory = with_gaps(&trajectory, &trusted);
@@ -62,10 +54,10 @@ fn write_localization(
     table.add_numbers("distance_m", Some(&driven_m), |distance_m| *distance_m);
     table.add_poses("truth", truth);
     table.add_poses("mcl", Some(estimates));
-    table.add_errors("mcl", mcl_errors.as_deref());
-    table.add_deviations(covariances, axes.as_deref());
+    table.add_errors("mcl", Some(estimates).zip(truth));
+    table.add_deviations(covariances, estimates);
     table.add_poses("refined", refined);
-    table.add_errors("refined", refined_errors.as_deref());
+    table.add_errors("refined", refined.zip(truth));
     table.add("particles", particles, usize::to_string);
     let agreements = results.agreements.as_deref();
     table.add_numbers("agreement", agreements, |share| known(*share));
@@ -129,6 +121,9 @@ pub struct FrameTable<'a> {
     columns: Vec<(String, Cell<'a>)>,
 }
 
+/// The title of a column, and its number.
+type Titled<T> = (&'static str, fn(&T) -> f64);
+
 /// The cell of a row.
 type Cell<'a> = Box<dyn Fn(usize) -> String + 'a>;
 
@@ -161,10 +156,16 @@ impl<'a> FrameTable<'a> {
         items: Option<&'a [T]>,
         number: impl Fn(&T) -> f64 + 'a,
     ) {
-        self.add(title, items, move |item| match number(item) {
+        self.add_rows(title, items.map(|it| move |row: usize| number(&it[row])));
+    }
+
+    /// Adds a column with a number per row, where it is known.
+    fn add_rows(&mut self, title: impl Into<String>, number: Option<impl Fn(usize) -> f64 + 'a>) {
+        let cell = move |row| match number.as_ref().map_or(f64::NAN, |number| number(row)) {
             number if number.is_nan() => String::new(),
             number => format!("{number:.4}"),
-        });
+        };
+        self.columns.push((title.into(), Box::new(cell)));
     }
 
     fn add_poses(&mut self, name: &str, poses: Option<&'a [Pose2]>) {
@@ -175,30 +176,36 @@ impl<'a> FrameTable<'a> {
         });
     }
 
-    fn add_errors(&mut self, name: &str, errors: Option<&'a [PlanarError]>) {
-        self.add_numbers(
-            format!("{name}_position_error_m"),
-            errors,
-            PlanarError::distance_m,
-        );
-        self.add_numbers(format!("{name}_along_error_m"), errors, |e| e.along_m);
-        self.add_numbers(format!("{name}_across_error_m"), errors, |e| e.across_m);
-        self.add_numbers(format!("{name}_heading_error_deg"), errors, |e| {
-            e.turn_rad.to_degrees()
-        });
+    /// Adds the errors of poses against the true ones.
+    fn add_errors(&mut self, name: &str, poses: Option<(&'a [Pose2], &'a [Pose2])>) {
+        let errors: [Titled<PlanarError>; 4] = [
+            ("position_error_m", PlanarError::distance_m),
+            ("along_error_m", |error| error.along_m),
+            ("across_error_m", |error| error.across_m),
+            ("heading_error_deg", |error| error.turn_rad.to_degrees()),
+        ];
+        for (title, number) in errors {
+            let error = poses.map(|(poses, truth)| {
+                move |row: usize| number(&PlanarError::between(&poses[row], &truth[row]))
+            });
+            self.add_rows(format!("{name}_{title}"), error);
+        }
     }
 
     /// Adds the axes of the covariance of the position: a long one is a direction that the scene does not constrain.
-    fn add_deviations(
-        &mut self,
-        covariances: Option<&'a [Matrix3<f64>]>,
-        axes: Option<&'a [Axes]>,
-    ) {
-        self.add_numbers("mcl_sigma_long_m", axes, |axes| axes.long_m);
-        self.add_numbers("mcl_sigma_short_m", axes, |axes| axes.short_m);
-        self.add_numbers("mcl_long_axis_from_forward_deg", axes, |axes| {
-            axes.long_from_forward_rad.to_degrees()
-        });
+    fn add_deviations(&mut self, covariances: Option<&'a [Matrix3<f64>]>, poses: &'a [Pose2]) {
+        let axes: [Titled<Axes>; 3] = [
+            ("mcl_sigma_long_m", |axes| axes.long_m),
+            ("mcl_sigma_short_m", |axes| axes.short_m),
+            ("mcl_long_axis_from_forward_deg", |axes| {
+                axes.long_from_forward_rad.to_degrees()
+            }),
+        ];
+        for (title, number) in axes {
+            let axis =
+                covariances.map(|all| move |row: usize| number(&Axes::new(&all[row], &poses[row])));
+            self.add_rows(title, axis);
+        }
         self.add_numbers("mcl_sigma_heading_deg", covariances, |covariance| {
             covariance[(2, 2)].max(0.0).sqrt().to_degrees()
         });

@@ -23,6 +23,7 @@
 //! All but the first three are optional, and so are `particles` where there are `frames`: a trajectory without a map.
 //! They are NaN in rows before `start_idx`.
 
+use std::borrow::Cow;
 use std::io;
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -290,9 +291,9 @@ impl LocalizationResults {
 
     /// The stored estimates, or if there are none, weighted means of the particles; those in space, projected,
     /// of a trajectory without particles.
-    pub fn estimates_or_particle_means(&self, rules: &RangeMclRules) -> Result<Vec<Pose2>> {
+    pub fn estimates_or_particle_means(&self, rules: &RangeMclRules) -> Result<Cow<'_, [Pose2]>> {
         if let Some(estimates) = &self.estimates {
-            return Ok(estimates.to_vec());
+            return Ok((**estimates).into());
         }
         if let (true, Some(estimates)) = (self.particles.is_empty(), &self.estimates_in_space) {
             return Ok(estimates.iter().map(pose2_from_pose3).collect());

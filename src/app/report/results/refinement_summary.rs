@@ -7,7 +7,7 @@ use super::columns::Column;
 use super::localization_results::LocalizationResults;
 use super::rows::{MetricRow, Value, length, metrics};
 use super::run_summary::RunSummary;
-use crate::evaluation::{PlanarError, Summary, planar_errors};
+use crate::evaluation::{PlanarError, Summary};
 use crate::geometry::Pose2;
 
 /// How far a refinement moved the poses, how well they fit the map before and after it, and which it refused.
@@ -36,12 +36,12 @@ impl RefinementSummary {
         let trajectory = RunSummary::of_refined(results)?;
         let refined = results.refined.as_deref()?;
         let (before, after) = (results.trusted(), results.refined_trusted());
-        let moves = planar_errors(refined, &results.trajectory(estimates));
-        let moves = moves.into_iter().enumerate();
-        let moves: Vec<PlanarError> = moves
-            .filter(|&(row, _)| before[row] && after[row] && !results.is_only_smoothed(row))
-            .map(|(_, it)| it)
-            .collect();
+        let trajectory_before = results.trajectory(estimates);
+        let (moves_m, turns_rad) = (0..refined.len().min(trajectory_before.len()))
+            .filter(|&row| before[row] && after[row] && !results.is_only_smoothed(row))
+            .map(|row| PlanarError::between(&refined[row], &trajectory_before[row]))
+            .map(|it| (it.distance_m(), it.turn_rad))
+            .unzip();
         let known = |column: &Option<Column<[f64; 2]>>| -> Vec<[f64; 2]> {
             let rows = column.iter().flatten().zip(&after);
             rows.filter(|(pair, trusted)| **trusted && pair.iter().all(|&it| it >= 0.0))
@@ -61,8 +61,8 @@ impl RefinementSummary {
             trajectory,
             refined: costs_m.len(),
             refused: after.iter().filter(|trusted| !**trusted).count(),
-            moved_m: summary(moves.iter().map(|it| it.distance_m()).collect()),
-            turned_rad: summary(moves.iter().map(|it| it.turn_rad).collect()),
+            moved_m: summary(moves_m),
+            turned_rad: summary(turns_rad),
             cost_m: both(&costs_m),
             agreement: both(&known(&results.refinement_agreements)),
         })

@@ -1,5 +1,6 @@
 //! Which poses of a run are trusted: those of frames that are tracking.
 
+use std::borrow::Cow;
 use std::ops::Range;
 
 use super::columns::Column;
@@ -71,11 +72,12 @@ impl LocalizationResults {
     }
 
     /// The estimates, where frames before the first tracked one were filled back with them.
-    pub fn trajectory(&self, estimates: &[Pose2]) -> Vec<Pose2> {
-        self.trajectory_in_space.as_ref().map_or_else(
-            || estimates.to_vec(),
-            |poses| poses.iter().map(pose2_from_pose3).collect(),
-        )
+    pub fn trajectory<'a>(&self, estimates: &'a [Pose2]) -> Cow<'a, [Pose2]> {
+        self.trajectory_in_space
+            .as_ref()
+            .map_or(estimates.into(), |poses| {
+                poses.iter().map(pose2_from_pose3).collect()
+            })
     }
 }
 

@@ -1,5 +1,6 @@
 //! Pictures of a run.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -15,7 +16,7 @@ use crate::app::report::plotting::{
 use crate::app::report::results::{LocalizationResults, with_gaps};
 use crate::app::run::output::remove_if_exists;
 use crate::evaluation::trust::Axes;
-use crate::evaluation::{ParticleRow, planar_errors};
+use crate::evaluation::{ParticleRow, PlanarError, planar_errors};
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::Estimate;
@@ -104,7 +105,7 @@ struct Drawing<'a> {
     results: &'a LocalizationResults,
     /// Name of the estimates: those of the filter, or of a trajectory from elsewhere.
     name: &'static str,
-    estimates: Vec<Pose2>,
+    estimates: Cow<'a, [Pose2]>,
     /// The trajectory of the filter, with gaps where it is not trusted.
     trajectory: Vec<Pose2>,
     truth: Option<&'a [Pose2]>,
@@ -118,7 +119,7 @@ impl<'a> Drawing<'a> {
     ) -> Self {
         let is_given = results.particles.is_empty();
         let in_space = results.estimates_in_space.iter().flatten();
-        let estimates = results.estimates.as_deref().map(<[Pose2]>::to_vec);
+        let estimates = results.estimates.as_deref().map(Cow::from);
         let estimates = estimates.unwrap_or_else(|| in_space.map(pose2_from_pose3).collect());
         Self {
             files,
@@ -206,20 +207,18 @@ impl<'a> Drawing<'a> {
     fn errors(&self) -> Result<()> {
         let truth = self.truth.filter(|_| !self.results.particles.is_empty());
         let (x_name, x) = time_axis(self.results);
-        let refined = self.refined_with_gaps();
         let estimates = with_gaps(&self.estimates, &self.tracked());
         let found = [
-            (self.name, MCL, estimates),
-            ("refined", REFINED, refined.unwrap_or_default()),
+            (self.name, MCL, Some(estimates)),
+            ("refined", REFINED, self.refined_with_gaps()),
         ];
-        let found = found.into_iter().filter(|(_, _, poses)| !poses.is_empty());
-        let errors = found.map(|(name, color, poses)| {
-            let errors = planar_errors(&poses, truth.unwrap_or_default());
-            (name, color, x.iter().copied().zip(errors).collect())
+        let errors = found.into_iter().filter_map(|(name, color, poses)| {
+            let rows = poses?.into_iter().zip(truth.unwrap_or_default()).zip(&x);
+            let errors = rows.map(|((pose, truth), &x)| (x, PlanarError::between(&pose, truth)));
+            Some((name, color, errors))
         });
-        let errors: Vec<_> = errors.collect();
         self.save(
-            &error_chart("Errors over time", x_name, &errors),
+            &error_chart("Errors over time", x_name, errors),
             "errors.png",
         )
     }
@@ -231,7 +230,7 @@ impl<'a> Drawing<'a> {
             return Ok(());
         };
         let (x_name, x) = time_axis(self.results);
-        let axes = covariances.iter().zip(&self.estimates);
+        let axes = covariances.iter().zip(&*self.estimates);
         let sigmas_cm = axes.map(|(covariance, pose)| 100.0 * Axes::new(covariance, pose).long_m);
         let sigmas_cm: Vec<f64> = sigmas_cm.collect();
         let agreements = self.results.agreements.iter().flatten();
