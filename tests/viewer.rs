@@ -257,7 +257,8 @@ fn a_viewer_that_connects_during_the_drive_receives_and_decodes_every_channel() 
 fn a_viewer_that_connects_and_does_not_read_costs_the_filter_nothing_and_has_a_bounded_queue() {
     const FRAMES: usize = 120;
     let recording = Recording::street(FRAMES);
-    recording.fpmcl("build-map").succeeds();
+    // The street is longer than that of the other tests.
+    recording.fpmcl("build-map").set("depth", "8").succeeds();
     let arguments = ["live", "localization.yml", "--backend=cpu", "--json"];
     let arguments = [
         &arguments[..],
