@@ -248,8 +248,8 @@ impl Ups {
     /// The directions and biases that fit windows best, with the drift for which they are most likely; `None` with fewer than
     /// two windows.
     fn fit(windows: &[Window]) -> Option<Self> {
-        /// Halvings of the fastest drift; the slowest one tilts by less than 0.01 degrees in a kilometre.
-        const HALVINGS: i32 = 9;
+        /// Halvings of the fastest drift, 5 degrees in 100 m; the slowest one tilts by 0.02 degrees in a kilometre.
+        const HALVINGS: i32 = 12;
         let fits = (0..HALVINGS).map(|halving| Self::fit_with(windows, 0.5_f64.powi(halving)));
         let fits: Option<Vec<(f64, Self)>> = fits.collect();
         let likeliest = fits?.into_iter().min_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -322,8 +322,8 @@ impl Ups {
         const BIAS_M_S2: f64 = 0.3;
         const BIAS_WALK: f64 = 5e-4;
         /// Standard deviation of the fastest drift of the tilt [rad/m], and per window [rad].
-        const TILT_RAD_PER_M: f64 = 1e-4;
-        const TILT_RAD: f64 = 2e-4;
+        const TILT_RAD_PER_M: f64 = 8e-4;
+        const TILT_RAD: f64 = 1.6e-3;
         /// Turns about the direction up are not measured [rad].
         const FREE_RAD: f64 = 1.0;
         /// Scale of the robust kernel, in standard deviations.
