@@ -274,8 +274,9 @@ pub fn ranges_along(
 
 /// Returns the share of beams that end on a surface of the map, among those that reach one; `None` for
 /// fewer than 30 of them. Measured and rendered ranges agree within the tolerance. Beams along which the map has no
-/// surface do not count, nor do those that end in front of the map, on traffic, as long as they are no more than those
-/// that agree: traffic that hides most of the map is a wrong pose, or a sensor whose ranges are too short.
+/// surface do not count, nor do those that end in front of the map, on traffic, as long as they are no more than twice
+/// those that agree: traffic that hides more than two thirds of the map is a wrong pose, or a sensor whose ranges are too
+/// short. A lorry hides half.
 pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option<f64> {
     /// Smallest number of beams.
     const MIN_BEAMS: usize = 30;
@@ -291,7 +292,7 @@ pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option
             behind += 1;
         }
     }
-    let reaching = on + behind + in_front.saturating_sub(on);
+    let reaching = on + behind + in_front.saturating_sub(2 * on);
     (reaching >= MIN_BEAMS).then(|| on as f64 / reaching as f64)
 }
 
@@ -426,10 +427,12 @@ mod tests {
         assert_eq!(agreement(&beams, &[10.0; 90], 0.3), Some(1.0));
         assert_eq!(agreement(&beams, &[7.0; 90], 0.3), Some(0.0));
         assert_eq!(agreement(&beams, &[f32::INFINITY; 90], 0.3), None);
-        // Where 60 beams end in front of the surfaces on which 30 end, it is not traffic.
+        // Where 60 beams end in front of the surfaces on which 30 end, a lorry may hide the map; where 75 and 15, it does not.
         let mut rendered_m = [12.0; 90];
         rendered_m[60..].fill(10.0);
-        assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(0.5));
+        assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(1.0));
+        rendered_m[..75].fill(12.0);
+        assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(0.25));
         // 40 beams end behind the surface, 50 on it.
         let mut rendered_m = [4.0; 90];
         rendered_m[40..].fill(10.2);
