@@ -9,8 +9,8 @@
 //!
 //! R is the rotation `odom_from_imu`. The direction up in that frame changes as slowly as the odometry drifts, and the bias b of
 //! the accelerometer changes less: both are a random walk from window to window, found by robust least squares. A bias and a
-//! tilt look the same until the drive turns. How fast the odometry drifts is that for which the measurements are most likely
-//! (marginal likelihood): one that hardly drifts keeps its shape, which it knows better than an accelerometer.
+//! tilt look the same until the drive turns. The standard deviation of the drift is the candidate with the largest marginal
+//! likelihood, so that the noise of an accelerometer does not bend the path of an accurate odometry.
 //!
 //! The odometry is then integrated again with rotations whose tilt is that of gravity, so that its height follows, and
 //! each scan keeps its direction up as a weak constraint of the loops and of the adjustment.
@@ -248,9 +248,10 @@ impl Ups {
     /// The directions and biases that fit windows best, with the drift for which they are most likely; `None` with fewer than
     /// two windows.
     fn fit(windows: &[Window]) -> Option<Self> {
-        /// Halvings of the fastest drift, 5 degrees in 100 m; the slowest one tilts by 0.02 degrees in a kilometre.
-        const HALVINGS: i32 = 12;
-        let fits = (0..HALVINGS).map(|halving| Self::fit_with(windows, 0.5_f64.powi(halving)));
+        /// Candidates for the standard deviation of the drift, each half of the one before: of a drift in one direction from 5
+        /// degrees in 100 m to 0.02 degrees in a kilometre.
+        const CANDIDATES: i32 = 12;
+        let fits = (0..CANDIDATES).map(|halvings| Self::fit_with(windows, 0.5_f64.powi(halvings)));
         let fits: Option<Vec<(f64, Self)>> = fits.collect();
         let likeliest = fits?.into_iter().min_by(|a, b| a.0.total_cmp(&b.0))?;
         Some(likeliest.1)
@@ -273,7 +274,7 @@ impl Ups {
         if windows.len() < 2 {
             return None;
         }
-        let mut improbability = f64::INFINITY;
+        let mut minus_two_log_likelihood = f64::INFINITY;
         for iteration in 0..ITERATIONS {
             ups.residual_m_s2 = ups.residual(windows);
             let (cost, system) = ups.system(windows);
@@ -285,14 +286,14 @@ impl Ups {
             }
             if iteration + 1 == ITERATIONS {
                 ups.sigma_rad = ups.sigma(&system)?;
-                // The information of the drift is proportional to drift⁻² in three axes of each step.
-                improbability = cost
+                // Normalization of three axes of the drift and three of the measurement per window.
+                minus_two_log_likelihood = cost
                     + system.log_determinant()?
                     + 6.0 * (windows.len() as f64) * (drift.ln() + ups.sigma_m_s2().ln());
             }
         }
         ups.residual_m_s2 = ups.residual(windows);
-        Some((improbability, ups))
+        Some((minus_two_log_likelihood, ups))
     }
 
     fn difference(&self, row: usize, window: &Window) -> Vector3<f64> {
@@ -311,8 +312,8 @@ impl Ups {
 
     /// The standard deviation that the differences are weighted by [m/s²].
     fn sigma_m_s2(&self) -> f64 {
-        /// Least one, a tilt of 0.01 degrees: no accelerometer is known better.
-        const LEAST_M_S2: f64 = 0.002;
+        /// Least one, a tilt of 0.02 degrees: corners of the odometry and vibrations are not known better.
+        const LEAST_M_S2: f64 = 0.004;
         self.residual_m_s2.max(LEAST_M_S2)
     }
 
