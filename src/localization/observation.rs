@@ -274,25 +274,27 @@ pub fn ranges_along(
 
 /// Returns the share of beams that end on a surface of the map, among those that reach one; `None` for
 /// fewer than 30 of them. Measured and rendered ranges agree within the tolerance. Beams along which the map has no
-/// surface do not count, nor do those that end in front of the map, on traffic, as long as they are no more than twice
-/// those that agree: traffic that hides more than two thirds of the map is a wrong pose, or a sensor whose ranges are too
-/// short. A lorry hides half.
+/// surface do not count, nor do those that end in front of the map, on traffic. But of those that end just in front of it,
+/// within a quarter of the range, any in excess of the agreeing ones count as disagreeing: they show a wrong pose, or a
+/// sensor whose ranges are too short.
 pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option<f64> {
     /// Smallest number of beams.
     const MIN_BEAMS: usize = 30;
-    let (mut on, mut behind, mut in_front) = (0_usize, 0_usize, 0_usize);
+    /// Largest distance of a return to the surface behind it that counts, as a share of the range of the surface.
+    const NEAR: f32 = 0.25;
+    let (mut on, mut behind, mut just_in_front) = (0_usize, 0_usize, 0_usize);
     for (beam, &rendered_m) in beams.iter().zip(rendered_m) {
         let excess_m = beam.range_m - rendered_m;
         if rendered_m == f32::INFINITY {
         } else if excess_m < -tolerance_m {
-            in_front += 1;
+            just_in_front += usize::from(-excess_m <= NEAR * rendered_m);
         } else if excess_m <= tolerance_m {
             on += 1;
         } else {
             behind += 1;
         }
     }
-    let reaching = on + behind + in_front.saturating_sub(2 * on);
+    let reaching = on + behind + just_in_front.saturating_sub(on);
     (reaching >= MIN_BEAMS).then(|| on as f64 / reaching as f64)
 }
 
@@ -427,15 +429,30 @@ mod tests {
         assert_eq!(agreement(&beams, &[10.0; 90], 0.3), Some(1.0));
         assert_eq!(agreement(&beams, &[7.0; 90], 0.3), Some(0.0));
         assert_eq!(agreement(&beams, &[f32::INFINITY; 90], 0.3), None);
-        // Where 60 beams end in front of the surfaces on which 30 end, a lorry may hide the map; where 75 and 15, it does not.
-        let mut rendered_m = [12.0; 90];
+        // A lorry hides surfaces that are far behind it.
+        let mut rendered_m = [40.0; 90];
         rendered_m[60..].fill(10.0);
         assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(1.0));
-        rendered_m[..75].fill(12.0);
-        assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(0.25));
         // 40 beams end behind the surface, 50 on it.
         let mut rendered_m = [4.0; 90];
         rendered_m[40..].fill(10.2);
         assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(50.0 / 90.0));
+    }
+
+    #[test]
+    fn more_beams_just_in_front_of_the_map_than_on_it_count_against_a_pose() {
+        let beams = [Beam {
+            direction: Vec3::X,
+            range_m: 9.0,
+        }; 90];
+        let share = |in_front: usize| {
+            let mut rendered_m = [9.0; 90];
+            rendered_m[..in_front].fill(10.0);
+            agreement(&beams, &rendered_m, 0.3)
+        };
+        assert_eq!(share(0), Some(1.0));
+        assert_eq!(share(45), Some(1.0));
+        assert_eq!(share(60), Some(0.5));
+        assert_eq!(share(90), Some(0.0));
     }
 }

@@ -14,8 +14,8 @@
 //! confirmed.
 //!
 //! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) averages the
-//! likelihood instead; here traffic in front of the map must not raise an alarm, so that beams that
-//! end in front of the map are not counted.
+//! likelihood instead; here traffic in front of the map must not raise an alarm: beams that end in front of the map are
+//! ignored, but for those just in front of it in excess of the agreeing ones.
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
