@@ -291,7 +291,7 @@ fn a_log_of_a_process_that_is_killed_has_the_frames_until_then_and_is_not_replac
     fs::remove_file(&scan).unwrap();
     fs::write(&scan, bytes).unwrap();
     let again = || patient(&recording).with("--record=run.mcap");
-    let part = "run.unfinished.mcap exists, the log of a run that did not end; move it";
+    let part = "run.unfinished.mcap exists, the log of an interrupted run; move it";
     again().fails_with(&[part]);
     assert_eq!(common::messages_in(&log), left);
     again().with("--force").succeeds();

@@ -102,8 +102,7 @@ impl BlockSystem {
         .then_some(solution)
     }
 
-    /// Logarithm of the determinant of a chain, in which only neighbouring rows are connected; `None` if the system is not
-    /// positive definite.
+    /// Log-determinant of a block tridiagonal system, without other off-diagonal blocks; `None` if it is not positive definite.
     pub fn log_determinant(&self) -> Option<f64> {
         let factors = self.factorize()?.0;
         let of_row = |factor: &Factor| 2.0 * factor.own.l_dirty().diagonal().map(f64::ln).sum();

@@ -109,9 +109,9 @@ impl Odometer {
         })
     }
 
-    /// The same with a known motion at the first scan, which the second has not to search.
+    /// The same with a known motion at the first scan, so that the second needs no search.
     #[must_use]
-    pub(super) fn moving(self, first_motion: Option<Motion>) -> Self {
+    pub(super) fn with_first_motion(self, first_motion: Option<Motion>) -> Self {
         Self {
             first_motion,
             ..self

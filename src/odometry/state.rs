@@ -75,7 +75,7 @@ impl OdometerState {
             is_surprised: false,
         };
         state.restart(scan, config);
-        // A known motion has not to be searched.
+        // A known motion needs no search.
         state.first = state.first.filter(|_| motion.is_none());
         Some(state)
     }

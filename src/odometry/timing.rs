@@ -91,8 +91,9 @@ pub fn compare_timings(
     Ok(TimingComparison::decided(residuals_m))
 }
 
-/// Whether known times of points, or none, clearly fit best: better than none and the opposite direction, than both directions
-/// from the rear, or than the order of the points. Then no other start of the revolution has to be compared.
+/// Whether a configured timing has clearly the smallest residual, so that the full comparison is not needed. A rotation is
+/// compared with no times and the opposite direction; the order of the points with no times; no times with the order if the
+/// scans have one, otherwise with both directions that start at the rear.
 pub fn fits_best(
     timing: Option<PointTiming>,
     scans: &[Scan],
@@ -250,7 +251,7 @@ impl<'a> Runs<'a> {
 
     /// Mean residual of the registered scans; infinite if there are none [m].
     fn mean_residual(&self, candidate: Option<PointTiming>) -> Result<f64, TimingError> {
-        let mut odometer = Odometer::new(self.config.clone())?.moving(self.first_motion);
+        let mut odometer = Odometer::new(self.config.clone())?.with_first_motion(self.first_motion);
         let (mut sum_m, mut count) = (0.0, 0);
         for scan in self.scans {
             let estimate = odometer.step(&self.timed(scan, candidate))?;

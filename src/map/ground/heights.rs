@@ -27,9 +27,9 @@ const CHUNK_CELLS: i64 = 64;
 /// Triangles with longer edges are large [m].
 const LARGE_EDGE_M: f64 = 500.0;
 
-/// A large triangle that is narrower than this, or than this part of its longest edge, is an artefact, one with a lost
-/// vertex, not the surface of a road: no lane is that narrow, nor is one of 5 m straight and level for 50 km [m].
+/// Large triangles that are narrower are artefacts, of a lost vertex: no lane is that narrow [m].
 const NARROW_M: f64 = 2.0;
+/// The same as a part of the longest edge, 5 m in 50 km (unitless).
 const NARROW: f64 = 1e-4;
 
 /// Largest size of the chunks that a map in memory keeps, of about 16 kB per level each [bytes].

@@ -92,7 +92,7 @@ pub struct Message {
 impl Message {
     const NO_CHUNK: u32 = u32::MAX;
 
-    /// Most memory of one in an index that grows or is sorted [bytes].
+    /// Memory that is charged to the budget per message [bytes]: twice its size, because the vector doubles when it grows.
     pub const MOST_BYTES: u64 = 2 * size_of::<Self>() as u64;
 
     fn new(time_ns: u64, file: usize, place: Place) -> Self {

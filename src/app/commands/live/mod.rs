@@ -241,7 +241,7 @@ fn claim_log(log: &Path, config: &LocalizationConfig, context: &Context) -> Resu
     let is_left = std::fs::metadata(&unfinished).is_ok_and(|found| found.len() > 0);
     ensure!(
         config.output.force || !is_left,
-        "{} exists, the log of a run that did not end; move it, or add --force to replace it",
+        "{} exists, the log of an interrupted run; move it, or add --force to replace it",
         unfinished.display()
     );
     Ok(claims)

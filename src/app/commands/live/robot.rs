@@ -15,7 +15,7 @@ pub type ArrivedFrame = (Frame, Scan);
 pub struct MeasuredPose {
     /// Pose of the frame that the odometry measures: `p_odom = odom_from_child * p_child`.
     pub odom_from_child: Pose3,
-    /// The lidar on it at that time; `None` if it is not known by now.
+    /// Pose of the lidar in that frame at that time; `None` while no transforms connect the two.
     pub child_from_lidar: Option<Pose3>,
 }
 

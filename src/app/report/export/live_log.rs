@@ -24,7 +24,7 @@ use crate::localization::Estimate;
 /// Frames that may wait until they are encoded: those of three seconds of most sensors.
 const MOST_WAITING: usize = 32;
 
-/// Time after which what was sent is kept, also if the process is killed.
+/// Time between flushes of the log.
 const FLUSH: Duration = Duration::from_secs(1);
 
 /// A frame that was localized.

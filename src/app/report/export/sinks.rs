@@ -31,7 +31,7 @@ pub trait MessageSink {
     /// Takes a message.
     fn write(&mut self, message: &Message) -> Result<()>;
 
-    /// Keeps what was written, also if the process is killed.
+    /// Writes what waits to the file, so that it is kept if the process is killed.
     fn flush(&mut self) -> Result<()> {
         Ok(())
     }

@@ -18,7 +18,7 @@ const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
 const INTERACTIVE_SCRIPT: &str = include_str!("interactive.js");
 
-/// Begins the content of an interactive path; no text does, as `<` is escaped.
+/// Tag before the JSON of an interactive path. It cannot occur in a text, where `<` is escaped.
 const CONTENT: &str = "<script type=\"application/json\">";
 
 /// One HTML file.

@@ -48,7 +48,7 @@ impl InteractivePath<'_> {
     }
 }
 
-/// The content, whose numbers of frames are made when they are written.
+/// The content, whose values per frame are computed while they are written.
 struct Content<'a> {
     path: &'a InteractivePath<'a>,
     map: Option<Value>,

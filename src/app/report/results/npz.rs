@@ -210,7 +210,7 @@ pub fn write_npy<T: AutoSerialize>(
     shape: &[usize],
     numbers: impl IntoIterator<Item = T>,
 ) -> io::Result<()> {
-    /// Of a million frames hundreds of megabytes are written when a command is stopped [bytes].
+    /// Of the file [bytes]: the results of a million frames are hundreds of megabytes, written after a signal.
     const BUFFER: usize = 1 << 20;
     let shape: Vec<u64> = shape.iter().map(|&extent| extent as u64).collect();
     let mut array = npyz::WriteOptions::new()

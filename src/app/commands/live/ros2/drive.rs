@@ -45,7 +45,7 @@ pub fn check(config: &LocalizationConfig) -> Result<()> {
     ];
     if let Some((key, Some(file))) = sensors.into_iter().find(|(_, file)| file.is_some()) {
         bail!(
-            "{key} is {}, but it is read with the scans of a recording (--replay) only; set it to null",
+            "{key} is {}, but with --ros2 no inertial sensor or receiver is read; set {key} to null, or leave out its flag",
             file.display()
         );
     }

@@ -27,7 +27,7 @@ enum Joint {
     Moving(PoseBuffer),
 }
 
-/// How a frame is in another one to which transforms join it.
+/// Pose of a frame in another one to which transforms connect it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Relation {
     /// Pose of the frame; `None` where a transform between the two is not known at the time.
@@ -61,8 +61,8 @@ impl FrameTree {
         self.0.insert(transform.child, link);
     }
 
-    /// Adds the pose of a transform that moves, if its child is one of some frames or above one; returns whether it is. A child
-    /// has one parent, the first.
+    /// Adds a pose of a moving transform if its child is one of the frames `below` or an ancestor of one; returns whether it is.
+    /// The first parent of a child is kept.
     pub fn add_moving(&mut self, transform: &FramePose, below: &[&str]) -> bool {
         let FramePose {
             time_s,
@@ -70,7 +70,7 @@ impl FrameTree {
             child,
             parent_from_child,
         } = transform;
-        // Those of wheels and doors move, too.
+        // Moving transforms of other parts, such as wheels, are not needed.
         if !below.iter().any(|frame| self.is_above(child, frame)) {
             return false;
         }
@@ -113,7 +113,7 @@ impl FrameTree {
             })
     }
 
-    /// The topmost frame above another one, which may be that itself, and how the other one is in it at a time [s].
+    /// Root of the tree above a frame, which may be the frame itself, and the pose of the frame in it at a time [s].
     pub fn top_above<'a>(&'a self, frame: &'a str, time_s: f64) -> (&'a str, Relation) {
         let above = self.ancestors(frame, time_s);
         above
@@ -122,7 +122,7 @@ impl FrameTree {
             .unwrap_or_else(|| (frame, Relation::identity()))
     }
 
-    /// A frame, its parent and so on, each with how the frame is in it at a time [s].
+    /// A frame and its ancestors, each with the pose of the frame in it at a time [s].
     fn ancestors<'a>(&'a self, frame: &'a str, time_s: f64) -> Vec<(&'a str, Relation)> {
         let mut below = Relation::identity();
         let above = self.links(frame).map(|link| {

@@ -95,8 +95,7 @@ impl Shared {
         }
     }
 
-    /// Takes transforms that change, of which some may be where the odometry has the robot, or the robot the lidar. Those from the map
-    /// are our own.
+    /// Takes poses of moving transforms. Those whose parent is the frame of the map are published by this program, and left out.
     pub fn transforms(&self, transforms: Vec<FramePose>) {
         let mut known = self.known();
         let Known {
