@@ -7,7 +7,7 @@ use nalgebra::{Matrix6, Vector6};
 use super::config::OdometryConfig;
 use super::state::{OdometerState, Registered};
 use crate::geometry::Pose3;
-use crate::lidar::{Motion, PERIOD_S, Scan, interval_s};
+use crate::lidar::{PERIOD_S, Scan, interval_s};
 use crate::memory::MemoryError;
 use crate::validation::{InvalidValue, Validate as _};
 
@@ -87,8 +87,6 @@ pub struct OdometryEstimate {
 #[derive(Clone, Debug)]
 pub struct Odometer {
     config: OdometryConfig,
-    /// The motion at the first scan, where it is known.
-    first_motion: Option<Motion>,
     state: Option<OdometerState>,
     /// Time of the last scan [s].
     time_s: Option<f64>,
@@ -103,19 +101,9 @@ impl Odometer {
         config.validate()?;
         Ok(Self {
             config,
-            first_motion: None,
             state: None,
             time_s: None,
         })
-    }
-
-    /// The same with a known motion at the first scan, so that the second needs no search.
-    #[must_use]
-    pub(super) fn with_first_motion(self, first_motion: Option<Motion>) -> Self {
-        Self {
-            first_motion,
-            ..self
-        }
     }
 
     /// Registers the next scan. Points with times are compensated by the estimated motion; points without are taken as
@@ -130,7 +118,7 @@ impl Odometer {
         let mut estimate = match &mut self.state {
             Some(state) => advance(state, scan, duration_s, &self.config),
             None => {
-                self.state = OdometerState::begin(scan, self.first_motion, &self.config);
+                self.state = OdometerState::begin(scan, &self.config);
                 OdometryEstimate::first(duration_s)
             }
         };

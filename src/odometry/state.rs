@@ -57,7 +57,7 @@ pub struct Registered {
 
 impl OdometerState {
     /// The state after the first scan; `None` if it has too few points.
-    pub fn begin(scan: &Scan, motion: Option<Motion>, config: &OdometryConfig) -> Option<Self> {
+    pub fn begin(scan: &Scan, config: &OdometryConfig) -> Option<Self> {
         let range_m = sensor_range(scan)?;
         let mut state = Self {
             map: VoxelMap::new(config.voxel_share * range_m, config.voxel_points),
@@ -66,7 +66,7 @@ impl OdometerState {
             odom_from_lidar: Pose3::identity(),
             mapped: Pose3::identity(),
             waited_s: 0.0,
-            motion,
+            motion: None,
             first: None,
             deviation: [0.0; 2],
             cost: 1.0,
@@ -75,8 +75,6 @@ impl OdometerState {
             is_surprised: false,
         };
         state.restart(scan, config);
-        // A known motion needs no search.
-        state.first = state.first.filter(|_| motion.is_none());
         Some(state)
     }
 

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use super::config::OdometryConfig;
 use super::odometer::{Odometer, OdometryError};
-use crate::lidar::{FiringOrder, Motion, PointTiming, Rotation, RotationDirection, Scan};
+use crate::lidar::{FiringOrder, PointTiming, Rotation, RotationDirection, Scan};
 use crate::statistics::median;
 use crate::validation::{InvalidValue, Validate as _};
 
@@ -165,8 +165,6 @@ fn period_of_order(scans: &[Scan], interval_s: f64) -> Option<f64> {
 struct Runs<'a> {
     scans: &'a [Scan],
     config: OdometryConfig,
-    /// The motion between the first two, without times of points.
-    first_motion: Option<Motion>,
 }
 
 /// A rotation and its mean residual [m].
@@ -180,30 +178,7 @@ impl<'a> Runs<'a> {
             min_common_share: 0.0,
             ..config.clone()
         };
-        let mut runs = Self {
-            scans,
-            config,
-            first_motion: None,
-        };
-        let mut odometer = Odometer::new(runs.config.clone())?;
-        for scan in scans.iter().take(2) {
-            let estimate = odometer.step(&runs.timed(scan, None))?;
-            runs.first_motion = estimate.residual_m.map(|_| Motion {
-                previous_from_current: estimate.previous_from_current,
-                duration_s: estimate.duration_s,
-            });
-        }
-        Ok(runs)
-    }
-
-    /// A scan with the times of a candidate. Large ones are thinned to every third point, fifth and so on: odd steps pass
-    /// through all beams.
-    fn timed(&self, scan: &Scan, candidate: Option<PointTiming>) -> Scan {
-        /// Least number of points that are left.
-        const POINTS: usize = 30_000;
-        let mut scan = scan.clone();
-        scan.times_s = candidate.map_or_else(Vec::new, |timing| timing.point_times(&scan));
-        scan.every((scan.len() / POINTS).saturating_sub(1) / 2 * 2 + 1)
+        Ok(Self { scans, config })
     }
 
     fn compared(
@@ -249,13 +224,19 @@ impl<'a> Runs<'a> {
         rotations.par_iter().map(residual).collect()
     }
 
-    /// Mean residual of the registered scans; infinite if there are none [m].
+    /// Mean residual of the registered scans; infinite if there are none [m]. Large scans are thinned to every third point, fifth
+    /// and so on: odd steps pass through all beams.
     fn mean_residual(&self, candidate: Option<PointTiming>) -> Result<f64, TimingError> {
-        let mut odometer = Odometer::new(self.config.clone())?.with_first_motion(self.first_motion);
+        /// Least number of points that are left.
+        const POINTS: usize = 30_000;
+        let mut odometer = Odometer::new(self.config.clone())?;
         let (mut sum_m, mut count) = (0.0, 0);
         for scan in self.scans {
-            let estimate = odometer.step(&self.timed(scan, candidate))?;
-            if let Some(residual_m) = estimate.residual_m {
+            let mut scan = scan.clone();
+            scan.times_s = candidate.map_or_else(Vec::new, |timing| timing.point_times(&scan));
+            let step = (scan.len() / POINTS).saturating_sub(1) / 2 * 2 + 1;
+            let scan = scan.every(step);
+            if let Some(residual_m) = odometer.step(&scan)?.residual_m {
                 sum_m += residual_m;
                 count += 1;
             }
