@@ -92,7 +92,7 @@ pub fn compare_timings(
 }
 
 /// Whether a configured timing has clearly the smallest residual, so that the full comparison is not needed. A rotation is
-/// compared with no times and the opposite direction; the order of the points with no times; no times with the order if the
+/// compared with no times, the opposite direction and its starts by quarters of a turn; the order of the points with no times; no times with the order if the
 /// scans have one, otherwise with both directions that start at the rear.
 pub fn fits_best(
     timing: Option<PointTiming>,
@@ -109,7 +109,10 @@ pub fn fits_best(
     };
     let others = match (timing, period_of_order(scans, period_s)) {
         (Some(PointTiming::Rotation(rotation)), _) => {
-            vec![None, Some(PointTiming::Rotation(rotation.reversed()))]
+            let turned = [FRAC_PI_2, PI, -FRAC_PI_2].map(|turn| rotation.turned(turn));
+            let others = turned.into_iter().chain([rotation.reversed()]);
+            let others = others.map(|it| Some(PointTiming::Rotation(it)));
+            [None].into_iter().chain(others).collect()
         }
         (Some(PointTiming::Order { .. }), _) => vec![None],
         (None, Some(period_s)) => vec![Some(PointTiming::Order { period_s })],

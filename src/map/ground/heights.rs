@@ -27,10 +27,11 @@ const CHUNK_CELLS: i64 = 64;
 /// Triangles with longer edges are large [m].
 const LARGE_EDGE_M: f64 = 500.0;
 
-/// Large triangles that are narrower are artefacts, of a lost vertex: no lane is that narrow [m].
-const NARROW_M: f64 = 2.0;
-/// The same as a part of the longest edge, 5 m in 50 km (unitless).
-const NARROW: f64 = 1e-4;
+/// A large triangle that is narrower than this part of its longest edge is an artefact, one with a lost vertex (unitless),
+/// unless it may be one of a straight road: of a lane's width at least, and not longer than straight roads are [m].
+const NARROW: f64 = 0.01;
+const LANE_M: f64 = 2.0;
+const STRAIGHT_M: f64 = 2000.0;
 
 /// Largest size of the chunks that a map in memory keeps, of about 16 kB per level each [bytes].
 const KEPT_BYTES: usize = 1 << 26;
@@ -334,7 +335,8 @@ pub(crate) fn is_artefact(corners: [DVec3; 3]) -> bool {
     let [a, b, c] = corners.map(DVec3::truncate);
     let longest_m = (b - a).length().max((c - a).length()).max((c - b).length());
     let width_m = (b - a).perp_dot(c - a).abs() / longest_m;
-    is_large(corners) && width_m < NARROW_M.max(NARROW * longest_m)
+    let is_of_road = width_m >= LANE_M && longest_m <= STRAIGHT_M;
+    is_large(corners) && width_m < NARROW * longest_m && !is_of_road
 }
 
 /// Middle of a chunk of cells of an edge.
