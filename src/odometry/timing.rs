@@ -91,38 +91,28 @@ pub fn compare_timings(
     Ok(TimingComparison::decided(residuals_m))
 }
 
-/// Whether a configured timing has clearly the smallest residual, so that the full comparison is not needed. A rotation is
-/// compared with no times, the opposite direction and its starts by quarters of a turn; the order of the points with no times; no times with the order if the
-/// scans have one, otherwise with both directions that start at the rear.
+/// Whether a configured timing has clearly the smallest residual, so that the full comparison is not needed: smaller than no
+/// times and, of a rotation, the opposite direction and the other starts by quarters of a turn.
 pub fn fits_best(
-    timing: Option<PointTiming>,
+    timing: PointTiming,
     scans: &[Scan],
-    period_s: f64,
     config: &OdometryConfig,
 ) -> Result<bool, TimingError> {
-    let from_rear = |direction| {
-        Some(PointTiming::Rotation(Rotation {
-            direction,
-            period_s,
-            start_rad: PI,
-        }))
-    };
-    let others = match (timing, period_of_order(scans, period_s)) {
-        (Some(PointTiming::Rotation(rotation)), _) => {
-            let turned = [FRAC_PI_2, PI, -FRAC_PI_2].map(|turn| rotation.turned(turn));
-            let others = turned.into_iter().chain([rotation.reversed()]);
-            let others = others.map(|it| Some(PointTiming::Rotation(it)));
-            [None].into_iter().chain(others).collect()
+    let timings = match timing {
+        PointTiming::Order { .. } => vec![timing],
+        PointTiming::Rotation(rotation) => {
+            let rotations = quarters(rotation).into_iter().chain([rotation.reversed()]);
+            rotations.map(PointTiming::Rotation).collect()
         }
-        (Some(PointTiming::Order { .. }), _) => vec![None],
-        (None, Some(period_s)) => vec![Some(PointTiming::Order { period_s })],
-        (None, None) => vec![
-            from_rear(RotationDirection::Clockwise),
-            from_rear(RotationDirection::CounterClockwise),
-        ],
     };
-    let candidates = [vec![timing], others].concat();
-    Ok(Runs::new(scans, config)?.compared(candidates)?.best == Some(0))
+    let candidates = timings.into_iter().map(Some).chain([None]);
+    let compared = Runs::new(scans, config)?.compared(candidates.collect())?;
+    Ok(compared.best == Some(0))
+}
+
+/// A rotation, and the others that start quarters of a turn from it.
+fn quarters(first: Rotation) -> [Rotation; 4] {
+    [0.0, FRAC_PI_2, PI, -FRAC_PI_2].map(|turn| first.turned(turn))
 }
 
 impl TimingComparison {
@@ -199,7 +189,7 @@ impl<'a> Runs<'a> {
     fn best_quarter(&self, first: Rotation) -> Result<Fitted, TimingError> {
         /// Decrease of the residual by which another start than the first is better (unitless).
         const BETTER: f64 = 0.03;
-        let turned = [0.0, FRAC_PI_2, PI, -FRAC_PI_2].map(|turn| first.turned(turn));
+        let turned = quarters(first);
         let residuals_m = self.residuals_of(&turned)?;
         let first_m = residuals_m[0];
         let others = turned.into_iter().zip(residuals_m).skip(1);
@@ -235,11 +225,13 @@ impl<'a> Runs<'a> {
         let mut odometer = Odometer::new(self.config.clone())?;
         let (mut sum_m, mut count) = (0.0, 0);
         for scan in self.scans {
-            let mut scan = scan.clone();
-            scan.times_s = candidate.map_or_else(Vec::new, |timing| timing.point_times(&scan));
             let step = (scan.len() / POINTS).saturating_sub(1) / 2 * 2 + 1;
-            let scan = scan.every(step);
-            if let Some(residual_m) = odometer.step(&scan)?.residual_m {
+            let times_s = candidate.map_or_else(Vec::new, |timing| timing.point_times(scan));
+            let thinned = Scan {
+                times_s: times_s.into_iter().step_by(step).collect(),
+                ..scan.every(step)
+            };
+            if let Some(residual_m) = odometer.step(&thinned)?.residual_m {
                 sum_m += residual_m;
                 count += 1;
             }

@@ -323,7 +323,9 @@ fn warn_of_contradiction(
     }
     let period_s = period_s(recording).unwrap_or(PERIOD_S);
     let (configured, config) = (configured.timing(period_s), OdometryConfig::default());
-    if fits_best(configured, &scans, period_s, &config)? {
+    if let Some(timing) = configured
+        && fits_best(timing, &scans, &config)?
+    {
         return Ok(());
     }
     let compared = compare_timings(&scans, period_s, &config)?;
