@@ -93,7 +93,7 @@ impl Message {
     const NO_CHUNK: u32 = u32::MAX;
 
     /// Memory that is charged to the budget per message [bytes]: twice its size, because the vector doubles when it grows.
-    pub const MOST_BYTES: u64 = 2 * size_of::<Self>() as u64;
+    pub const BUDGETED_BYTES: u64 = 2 * size_of::<Self>() as u64;
 
     fn new(time_ns: u64, file: usize, place: Place) -> Self {
         let (position, offset) = match place {

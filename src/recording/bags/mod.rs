@@ -28,6 +28,8 @@ use std::sync::atomic::Ordering;
 pub use bag_file::EXTENSIONS;
 pub use index::Topic;
 pub use message::FramePose;
+#[cfg(feature = "ros2")]
+pub use transforms::at_nearest_common;
 pub use transforms::transform_between;
 
 use super::error::RecordingError;
@@ -131,17 +133,18 @@ impl Bag {
         let mut files = Vec::new();
         let mut index = Index::default();
         for file in bag_file::paths(path).map_err(|problem| bad(path, problem))? {
-            let most_messages = budget.bytes / Message::MOST_BYTES - index.read as u64;
+            let most_messages =
+                (budget.bytes / Message::BUDGETED_BYTES).saturating_sub(index.read as u64);
             let empty = || Index::of_file(files.len(), most_messages as usize);
             let opened = BagFile::open(&file, empty);
             let (file, added) = opened.map_err(|problem| bad(&file, problem))?;
             index.append(added);
-            let bytes = Message::MOST_BYTES as f64 * index.read as f64;
-            budget
-                .require("the index of a bag", bytes, REMEDY)
-                .map_err(|error| RecordingError::read(&file.path)(io::Error::other(error)))?;
             files.push(file);
         }
+        let bytes = Message::BUDGETED_BYTES as f64 * index.read as f64;
+        budget
+            .require("the index of a bag", bytes, REMEDY)
+            .map_err(|error| RecordingError::read(path)(io::Error::other(error)))?;
         for topic in &mut index.topics {
             topic.messages.sort_by_key(|message| message.time_ns);
         }

@@ -16,14 +16,17 @@ pub fn transform_between(transforms: &[FramePose], target: &str, source: &str) -
         .iter()
         .map(|it| (it.child.as_str(), it))
         .collect();
-    let to_source = ancestors(&by_child, source);
-    // The nearest common ancestor.
-    for (frame, ancestor_from_target) in ancestors(&by_child, target) {
-        if let Some((_, ancestor_from_source)) = to_source.iter().find(|it| it.0 == frame) {
-            return Some(ancestor_from_target.inverse() * ancestor_from_source);
-        }
-    }
-    None
+    let [ancestor_from_target, ancestor_from_source] =
+        at_nearest_common(&ancestors(&by_child, target), &ancestors(&by_child, source))?;
+    Some(ancestor_from_target.inverse() * ancestor_from_source)
+}
+
+/// What two paths upwards, of frames and what is known of each, have at their nearest common frame; `None` if there is none.
+pub fn at_nearest_common<T: Copy>(a: &[(&str, T)], b: &[(&str, T)]) -> Option<[T; 2]> {
+    a.iter().find_map(|(frame, of_a)| {
+        let (_, of_b) = b.iter().find(|it| it.0 == *frame)?;
+        Some([*of_a, *of_b])
+    })
 }
 
 /// A frame, its parent and so on, each with its transform `ancestor_from_frame`.

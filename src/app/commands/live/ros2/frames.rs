@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use super::pose_buffer::PoseBuffer;
 use crate::geometry::Pose3;
 use crate::recording::FramePose;
+use crate::recording::bags::at_nearest_common;
 
 /// Largest number of static transforms: those of a robot with many sensors.
 const MOST_STATIC: usize = 1000;
@@ -97,20 +98,16 @@ impl FrameTree {
         true
     }
 
-    /// How `source` is in `target` at a time [s], `p_target = pose * p_source`; `None` if no transforms join the frames.
+    /// Pose of `source` in `target` at a time [s], `p_target = pose * p_source`; `None` if no transforms connect the frames.
     pub fn between(&self, target: &str, source: &str, time_s: f64) -> Option<Relation> {
-        let above_source = self.ancestors(source, time_s);
-        // The nearest common ancestor.
-        self.ancestors(target, time_s)
-            .into_iter()
-            .find_map(|(frame, of_target)| {
-                let (_, of_source) = above_source.iter().find(|it| it.0 == frame)?;
-                let pose = of_target.pose.zip(of_source.pose);
-                Some(Relation {
-                    pose: pose.map(|(target, source)| target.inverse() * source),
-                    is_moving: of_target.is_moving || of_source.is_moving,
-                })
-            })
+        let [above_target, above_source] =
+            [target, source].map(|frame| self.ancestors(frame, time_s));
+        let [of_target, of_source] = at_nearest_common(&above_target, &above_source)?;
+        let pose = of_target.pose.zip(of_source.pose);
+        Some(Relation {
+            pose: pose.map(|(target, source)| target.inverse() * source),
+            is_moving: of_target.is_moving || of_source.is_moving,
+        })
     }
 
     /// Root of the tree above a frame, which may be the frame itself, and the pose of the frame in it at a time [s].
