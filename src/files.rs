@@ -98,8 +98,8 @@ impl AtomicFile {
     }
 }
 
-/// A file that grows under a name of its own, under which it stays if the process is killed, and is renamed once it is complete. It is
-/// locked, so that one that a killed process left is known by being unlocked.
+/// A file that is written under a name of its own and renamed by [`persist`](Self::persist). Without that, or
+/// [`remove`](Self::remove), it stays, as after SIGKILL or on a full disk; it is locked while it is written.
 pub struct GrowingFile {
     path: PathBuf,
     file: File,
@@ -108,7 +108,7 @@ pub struct GrowingFile {
 }
 
 impl GrowingFile {
-    /// Creates the file at `unfinished`, in the folder of `path`, which must exist, and replaces one that nobody writes.
+    /// Creates the file at `unfinished`, in the folder of `path`, which must exist, and replaces one that no process has locked.
     pub fn create(path: &Path, unfinished: &Path) -> io::Result<Self> {
         let (place, unfinished) = (Place::of(path)?, Place::of(unfinished)?);
         if let Ok(left) = File::open(&unfinished.path) {

@@ -272,21 +272,20 @@ pub fn ranges_along(
     Ok(rows.pop().unwrap_or_default())
 }
 
-/// Returns the share of beams that end on a surface of the map, among those that reach one; `None` for
-/// fewer than 30 of them. Measured and rendered ranges agree within the tolerance. Beams along which the map has no
-/// surface do not count, nor do those that end in front of the map, on traffic. But of those that end just in front of it,
-/// within a quarter of the range, any in excess of the agreeing ones count as disagreeing: they show a wrong pose, or a
-/// sensor whose ranges are too short.
+/// Returns the share of agreeing beams, whose measured and rendered ranges differ by the tolerance at most, among those that
+/// count; `None` if fewer than 30 count. Beams along which the map has no surface do not count, nor do those that end in
+/// front of it, on traffic. But of those that end within a quarter of the range in front of it, any in excess of the
+/// agreeing beams count as disagreeing: they show a wrong pose, or ranges that are too short.
 pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option<f64> {
     /// Smallest number of beams.
     const MIN_BEAMS: usize = 30;
     /// Largest distance of a return to the surface behind it that counts, as a share of the range of the surface.
     const NEAR: f32 = 0.25;
     let (mut on, mut behind, mut just_in_front) = (0_usize, 0_usize, 0_usize);
-    for (beam, &rendered_m) in beams.iter().zip(rendered_m) {
+    let reaching = (beams.iter().zip(rendered_m)).filter(|(_, m)| **m != f32::INFINITY);
+    for (beam, rendered_m) in reaching {
         let excess_m = beam.range_m - rendered_m;
-        if rendered_m == f32::INFINITY {
-        } else if excess_m < -tolerance_m {
+        if excess_m < -tolerance_m {
             just_in_front += usize::from(-excess_m <= NEAR * rendered_m);
         } else if excess_m <= tolerance_m {
             on += 1;
@@ -294,8 +293,8 @@ pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option
             behind += 1;
         }
     }
-    let reaching = on + behind + just_in_front.saturating_sub(on);
-    (reaching >= MIN_BEAMS).then(|| on as f64 / reaching as f64)
+    let counted = on + behind + just_in_front.saturating_sub(on);
+    (counted >= MIN_BEAMS).then(|| on as f64 / counted as f64)
 }
 
 /// Returns the beams that end above the road, which distinguish one place from another.

@@ -27,10 +27,14 @@ const CHUNK_CELLS: i64 = 64;
 /// Triangles with longer edges are large [m].
 const LARGE_EDGE_M: f64 = 500.0;
 
-/// A large triangle that is narrower than this part of its longest edge is an artefact, one with a lost vertex (unitless),
-/// unless it may be one of a straight road: of a lane's width at least, and not longer than straight roads are [m].
+/// A large triangle that is narrower than this share of its longest edge has a lost vertex, unless it may be one of a
+/// straight road (unitless).
 const NARROW: f64 = 0.01;
+
+/// Smallest width of a triangle of a road: no lane is narrower [m].
 const LANE_M: f64 = 2.0;
+
+/// Longest edge of a triangle of a road [m].
 const STRAIGHT_M: f64 = 2000.0;
 
 /// Largest size of the chunks that a map in memory keeps, of about 16 kB per level each [bytes].

@@ -221,7 +221,7 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
     report
 }
 
-/// Checks and claims a log and the file in which it grows. What a killed process left there is replaced with `force` only, as a log is.
+/// Checks and claims a log and the file in which it is written until the end. Both replace a file with `force` only.
 fn claim_log(log: &Path, config: &LocalizationConfig, context: &Context) -> Result<Claims> {
     let unfinished = unfinished_log(log);
     let inputs = [

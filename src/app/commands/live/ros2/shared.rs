@@ -48,13 +48,14 @@ struct Known {
 
 /// What of the robot is known at a scan.
 pub struct Place {
-    /// The frame of the robot where it is joined to the lidar, else that of the lidar.
+    /// The frame whose pose is published: that of the robot if it is connected to the lidar, else that of the lidar.
     pub child: String,
     /// `p_child = child_from_lidar * p_lidar`; `None` while a transform between them that moves is not known.
     pub child_from_lidar: Option<Pose3>,
-    /// The topmost frame above the child, that of the odometry where somebody publishes it; the child itself if nothing is above.
+    /// The topmost frame above the child, such as that of the odometry, or the child itself; while the lidar is not connected
+    /// to a robot that moves, the topmost above the robot.
     pub top_frame: String,
-    /// How the child is in it.
+    /// Pose of the child in it: `p_top = top.pose * p_child`.
     pub top: Relation,
     /// The moment of the scan [ns].
     pub moment_ns: u64,
@@ -217,7 +218,7 @@ impl Shared {
 }
 
 impl Known {
-    /// How the lidar is in a frame at a time [s]; `None` if no transforms join the two.
+    /// Pose of the lidar in a frame at a time [s]; `None` if no transforms connect the two.
     fn lidar_in(&self, frame: &str, time_s: f64) -> Option<Relation> {
         self.frames
             .between(frame, self.lidar_frame.as_deref()?, time_s)
