@@ -309,8 +309,16 @@ fn a_log_of_a_process_that_is_killed_has_the_frames_until_then_and_is_not_replac
 #[test]
 fn a_log_is_no_input_and_leaves_nothing_where_the_drive_does_not_begin() {
     let recording = street(3);
-    let call = patient(&recording).with("--record=map.ply").with("--force");
+    std::os::unix::fs::symlink("map.ply", recording.path("map.mcap")).unwrap();
+    let call = patient(&recording)
+        .with("--record=map.mcap")
+        .with("--force");
     call.fails_with(&["map.ply would be replaced, but it is an input (map_file)"]);
+    for output in ["report.json", ".fpmcl", "localization.npz"] {
+        let call = patient(&recording).with(format!("--record={output}"));
+        call.with("--force")
+            .fails_with(&["a name that ends in .mcap"]);
+    }
     fs::write(recording.path("map.ply"), "ply").unwrap();
     let call = patient(&recording).with("--record=run.mcap");
     call.fails_with(&["map.ply"]);

@@ -223,6 +223,13 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
 
 /// Checks and claims a log and the file in which it is written until the end. Both replace a file with `force` only.
 fn claim_log(log: &Path, config: &LocalizationConfig, context: &Context) -> Result<Claims> {
+    // No other output of a run ends so: a log never takes the place of one.
+    ensure!(
+        log.extension()
+            .is_some_and(|it| it.eq_ignore_ascii_case("mcap")),
+        "--record is {}, but the log is an MCAP file; give it a name that ends in .mcap",
+        log.display()
+    );
     let unfinished = unfinished_log(log);
     let inputs = [
         ("result_path", config.result_path.as_path()),
