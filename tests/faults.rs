@@ -578,7 +578,10 @@ fn fill_the_disk(reference: &Reference) -> Option<Row> {
         disk.remount("remount,size=64m");
         if ended.has_result() || reference.rerun(&copy.path(), "--threads=2", &mut row) {
             // What the disk had no place for may be missing in a cache until a command needs it.
-            let is_cached = |path: &Path| path.starts_with("results/map.ply.tiles");
+            let is_cached = |path: &Path| {
+                path.components()
+                    .any(|part| part.as_os_str() == "map.ply.tiles")
+            };
             reference.check_files(&copy.path(), &mut row, |path| !is_cached(path));
         }
     }
