@@ -140,6 +140,36 @@ fn a_standing_car_is_compared_with_the_map_and_is_sure_only_of_what_it_sees() {
 }
 
 #[test]
+fn the_scan_of_a_standing_car_that_agrees_far_less_than_usual_is_used() {
+    const USUAL: f64 = 0.98;
+    let street = TestWorld::street();
+    let start = street.pose_at(0.0, 0.0, 0.7);
+    let step = |usual: Option<f64>, turned_rad: f64| {
+        let config = LocalizerConfig::of_test(3);
+        let mut filter = tracking(config.clone(), start, Matrix3::zeros());
+        filter.agreement.observe(usual, &config.tracking_loss);
+        let mut rng = StdRng::seed_from_u64(1);
+        let still = Odometry::Increment(Pose2::identity());
+        let scan = street.scan(&(start * Pose2::rotation(turned_rad)));
+        let frame = filter.step(still, &scan, &SensorAttitude::default(), &mut rng);
+        frame.unwrap()
+    };
+    let config = LocalizerConfig::default().tracking_loss;
+    let mut between = 0;
+    for turned_rad in (0..60).map(|i| 0.002 * f64::from(i)) {
+        let without = step(None, turned_rad);
+        if without.updated {
+            continue;
+        }
+        let share = without.agreement.unwrap();
+        let is_low = share < config.lost_fraction * USUAL;
+        assert_eq!(step(Some(USUAL), turned_rad).updated, is_low, "{share}");
+        between += usize::from(is_low);
+    }
+    assert!(between > 0);
+}
+
+#[test]
 fn the_uncertain_heading_of_a_creeping_car_makes_its_position_uncertain() {
     let config = LocalizerConfig {
         motion: OdometryNoise::constant(0.0, 0.0, 0.0),

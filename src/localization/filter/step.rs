@@ -98,12 +98,15 @@ impl ParticleFilter {
         let config = &self.config.proposal;
         let beams = choose_beams(scan, config.weighed_beams, config.road_share, attitude, rng);
         coasted.agreement = self.agreement_at(&coasted.map_from_lidar, &beams, attitude)?;
-        let agrees =
-            (coasted.agreement).map(|share| share >= self.config.tracking_loss.min_agreement);
-        if agrees == Some(false) && self.phase == Phase::Tracking {
+        let config = &self.config.tracking_loss;
+        let is_too_low = |share| {
+            share < config.min_agreement || self.agreement.is_far_below_usual(Some(share), config)
+        };
+        let contradicts = coasted.agreement.map(is_too_low);
+        if contradicts == Some(true) && self.phase == Phase::Tracking {
             return Ok(None);
         }
-        let is_sure = self.is_precise(&coasted.covariance) && agrees == Some(true);
+        let is_sure = self.is_precise(&coasted.covariance) && contradicts == Some(false);
         coasted.state = self.phase.reported(is_sure);
         Ok(Some(coasted))
     }
