@@ -421,9 +421,9 @@ fn scans_that_start_elsewhere_each_time_are_compensated_by_the_order_of_their_po
         count("tracking") >= 29 && count("tracking") + count("filled") == 30,
         "{summary}"
     );
-    // 0.899 without times of the points.
-    let agreement = summary["agreement"]["median"].as_f64().unwrap();
-    assert!(agreement > 0.905, "{agreement}");
+    // 0.832 without times of the points, 0.849 with them.
+    let agreement = summary["agreement"]["mean"].as_f64().unwrap();
+    assert!(agreement > 0.84, "{agreement}");
 }
 
 #[test]

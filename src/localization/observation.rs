@@ -273,27 +273,22 @@ pub fn ranges_along(
 }
 
 /// Returns the share of agreeing beams, whose measured and rendered ranges differ by the tolerance at most, among those that
-/// count; `None` if fewer than 30 count. Beams along which the map has no surface do not count, nor do those that end in
-/// front of it, on traffic. But of those that end within a quarter of the range in front of it, any in excess of the
-/// agreeing beams count as disagreeing: they show a wrong pose, or ranges that are too short.
+/// count; `None` if fewer than 30 count. Beams along which the map has no surface do not count, nor do those that end far in
+/// front of it, on traffic; those that end within a quarter of the range in front of it show a wrong pose, or ranges that
+/// are too short.
 pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option<f64> {
     /// Smallest number of beams.
     const MIN_BEAMS: usize = 30;
     /// Largest distance of a return to the surface behind it that counts, as a share of the range of the surface.
     const NEAR: f32 = 0.25;
-    let (mut on, mut behind, mut just_in_front) = (0_usize, 0_usize, 0_usize);
+    let (mut on, mut counted) = (0_usize, 0_usize);
     let reaching = (beams.iter().zip(rendered_m)).filter(|(_, m)| **m != f32::INFINITY);
     for (beam, rendered_m) in reaching {
         let excess_m = beam.range_m - rendered_m;
-        if excess_m < -tolerance_m {
-            just_in_front += usize::from(-excess_m <= NEAR * rendered_m);
-        } else if excess_m <= tolerance_m {
-            on += 1;
-        } else {
-            behind += 1;
-        }
+        let is_traffic = excess_m < -tolerance_m && -excess_m > NEAR * rendered_m;
+        counted += usize::from(!is_traffic);
+        on += usize::from(excess_m.abs() <= tolerance_m);
     }
-    let counted = on + behind + just_in_front.saturating_sub(on);
     (counted >= MIN_BEAMS).then(|| on as f64 / counted as f64)
 }
 
@@ -439,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn more_beams_just_in_front_of_the_map_than_on_it_count_against_a_pose() {
+    fn beams_that_end_just_in_front_of_the_map_count_against_a_pose() {
         let beams = [Beam {
             direction: Vec3::X,
             range_m: 9.0,
@@ -450,8 +445,7 @@ mod tests {
             agreement(&beams, &rendered_m, 0.3)
         };
         assert_eq!(share(0), Some(1.0));
-        assert_eq!(share(45), Some(1.0));
-        assert_eq!(share(60), Some(0.5));
+        assert_eq!(share(45), Some(0.5));
         assert_eq!(share(90), Some(0.0));
     }
 }
