@@ -152,8 +152,8 @@ fn more_scans_than_poses_are_an_error_and_fewer_are_not() {
     fs::remove_file(recording.path("velodyne/000003.bin")).unwrap();
     recording.fpmcl("build-map").succeeds();
     recording.fpmcl("localize").succeeds();
-    let rows = fs::read_to_string(recording.path("results/mcl_tum.txt")).unwrap();
-    assert_eq!(rows.lines().count(), 3);
+    let frames = fs::read_to_string(recording.path("results/frames.csv")).unwrap();
+    assert_eq!(frames.lines().count(), 1 + 3);
 }
 
 #[test]
