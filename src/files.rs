@@ -406,6 +406,11 @@ fn remove_unlocked(folder: &Path, matches: &dyn Fn(&str) -> bool) -> io::Result<
     Ok(())
 }
 
+/// Whether the name of a file ends in an extension, in small or capital letters.
+pub fn has_extension(path: &Path, extension: &str) -> bool {
+    (path.extension()).is_some_and(|found| found.eq_ignore_ascii_case(extension))
+}
+
 /// The folder of a file.
 pub fn folder_of(path: &Path) -> &Path {
     match path.parent() {

@@ -17,6 +17,7 @@ use super::context::{Context, MachineArgs};
 use super::visible::{visible, visible_in_line};
 use crate::app::settings::{self, CommandConfig};
 use crate::file_path::{FilePath, text_of};
+use crate::files::has_extension;
 
 /// Configuration and machine.
 #[derive(Clone, Debug, Args)]
@@ -56,8 +57,7 @@ impl ValueParserFactory for FilePath {
 
 /// Whether a path is that of a configuration.
 pub fn is_config(path: &Path) -> bool {
-    let extension = path.extension();
-    extension.is_some_and(|it| it.eq_ignore_ascii_case("yml") || it.eq_ignore_ascii_case("yaml"))
+    has_extension(path, "yml") || has_extension(path, "yaml")
 }
 
 /// Arguments of a stage.

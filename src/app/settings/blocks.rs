@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::file_path::FilePath;
+use crate::files::has_extension;
 use crate::geometry::{Pose3, pose_from_degrees};
 use crate::georeference::GnssConfig;
 use crate::recording::{Layout, Selection};
@@ -222,8 +223,7 @@ pub fn is_result(path: &Path) -> bool {
         let read = File::open(path).and_then(|mut file| file.read_exact(&mut start));
         read.is_ok() && start == NPZ
     };
-    let extension = path.extension();
-    extension.is_some_and(|it| it.eq_ignore_ascii_case("npz")) || begins_as_archive()
+    has_extension(path, "npz") || begins_as_archive()
 }
 
 /// Requires a path that is not empty.

@@ -19,6 +19,7 @@ use self::point_times::set_times;
 pub use self::records::PointFormat;
 use super::error::RecordingError;
 use super::velodyne::read_bytes;
+use crate::files::has_extension;
 use crate::lidar::Scan;
 
 /// Extensions of the files that [`read`] reads.
@@ -153,8 +154,4 @@ fn table<'a>(path: &Path, bytes: &'a [u8]) -> Option<Result<Table<'a>, String>> 
     } else {
         None
     }
-}
-
-fn has_extension(path: &Path, extension: &str) -> bool {
-    (path.extension()).is_some_and(|found| found.eq_ignore_ascii_case(extension))
 }

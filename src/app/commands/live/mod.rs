@@ -31,6 +31,7 @@ use crate::app::run::arguments::yaml;
 use crate::app::run::{Claims, ConfigArgs, Context, Outputs, RecordingArgs, RunArgs};
 use crate::app::settings::LocalizationConfig;
 use crate::file_path::{FilePath, text_of};
+use crate::files::has_extension;
 use crate::localization::Start;
 
 /// Arguments of `live`.
@@ -223,10 +224,9 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
 
 /// Checks and claims a log and the file in which it is written until the end. Both replace a file with `force` only.
 fn claim_log(log: &Path, config: &LocalizationConfig, context: &Context) -> Result<Claims> {
-    // No other output of a run ends so: a log never takes the place of one.
+    // No other output of a run has this ending, so that a log never takes the place of one.
     ensure!(
-        log.extension()
-            .is_some_and(|it| it.eq_ignore_ascii_case("mcap")),
+        has_extension(log, "mcap"),
         "--record is {}, but the log is an MCAP file; give it a name that ends in .mcap",
         log.display()
     );
