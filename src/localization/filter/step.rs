@@ -98,15 +98,13 @@ impl ParticleFilter {
         let config = &self.config.proposal;
         let beams = choose_beams(scan, config.weighed_beams, config.road_share, attitude, rng);
         coasted.agreement = self.agreement_at(&coasted.map_from_lidar, &beams, attitude)?;
-        let config = &self.config.tracking_loss;
-        let is_too_low = |share| {
-            share < config.min_agreement || self.agreement.is_far_below_usual(Some(share), config)
-        };
-        let contradicts = coasted.agreement.map(is_too_low);
-        if contradicts == Some(true) && self.phase == Phase::Tracking {
+        let (agreement, config) = (coasted.agreement, &self.config.tracking_loss);
+        let contradicts = agreement.is_some_and(|share| share < config.min_agreement)
+            || self.agreement.is_far_below_usual(agreement, config);
+        if contradicts && self.phase == Phase::Tracking {
             return Ok(None);
         }
-        let is_sure = self.is_precise(&coasted.covariance) && contradicts == Some(false);
+        let is_sure = self.is_precise(&coasted.covariance) && agreement.is_some() && !contradicts;
         coasted.state = self.phase.reported(is_sure);
         Ok(Some(coasted))
     }
