@@ -7,7 +7,7 @@ use nalgebra::{Matrix6, Vector6};
 use super::config::OdometryConfig;
 use super::state::{OdometerState, Registered};
 use crate::geometry::Pose3;
-use crate::lidar::{PERIOD_S, Scan, interval_s};
+use crate::lidar::{Motion, PERIOD_S, Scan, interval_s};
 use crate::memory::MemoryError;
 use crate::validation::{InvalidValue, Validate as _};
 
@@ -124,6 +124,18 @@ impl Odometer {
         };
         estimate.elapsed = start.elapsed();
         Ok(estimate)
+    }
+
+    /// Predicts the next scan by a motion instead of constant velocity.
+    pub(super) fn expect(&mut self, scan: &Scan, previous_from_current: Pose3) {
+        let duration_s = self.duration_until(scan);
+        if let (Some(state), Ok(duration_s)) = (&mut self.state, duration_s) {
+            let motion = Motion {
+                previous_from_current,
+                duration_s,
+            };
+            state.expect(motion, &self.config);
+        }
     }
 
     /// Time since the previous scan [s].

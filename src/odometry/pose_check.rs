@@ -154,23 +154,45 @@ pub struct PoseCheck {
 }
 
 /// Checks poses against scans, about ten in succession; `None` if the sensor stands or its motion is uncertain.
+///
+/// Where the scans show another motion, they are registered again, each from the given one. In a tunnel they fit there, too:
+/// the rings of the beams look alike wherever the sensor is, so that the scans show no motion.
 pub fn check_poses(
     scans: &[Scan],
     given: &GivenPoses,
     config: &OdometryConfig,
 ) -> Result<Option<PoseCheck>, TimingError> {
-    let mut odometer = Odometer::new(config.clone())?;
-    let steps: Vec<OdometryEstimate> = (scans.iter())
-        .map(|scan| odometer.step(scan))
-        .collect::<Result<_, _>>()?;
-    let motions: Vec<Option<Pose3>> = steps.iter().map(certain_motion).collect();
-    Ok(compare(&motions, given))
+    let check = compare(&motions(scans, None, config, is_certain)?, given);
+    let fits = |check: &PoseCheck| check.fit == PoseFit::Fits;
+    if check.as_ref().is_none_or(fits) {
+        return Ok(check);
+    }
+    let from_given = compare(&motions(scans, Some(given), config, |_| true)?, given);
+    Ok(check.filter(|_| !from_given.as_ref().is_some_and(fits)))
 }
 
-/// The motion to a scan, where all of it is determined.
-fn certain_motion(step: &OdometryEstimate) -> Option<Pose3> {
-    let is_certain = step.state == StepState::Registered && step.degenerate_directions.is_empty();
-    is_certain.then_some(step.previous_from_current)
+/// Whether a scan shows all of its motion.
+fn is_certain(step: &OdometryEstimate) -> bool {
+    step.degenerate_directions.is_empty()
+}
+
+/// The motion to each scan, where it was registered and is used; expected is that of poses, where some are given.
+fn motions(
+    scans: &[Scan],
+    expected: Option<&GivenPoses>,
+    config: &OdometryConfig,
+    is_used: impl Fn(&OdometryEstimate) -> bool,
+) -> Result<Vec<Option<Pose3>>, TimingError> {
+    let mut odometer = Odometer::new(config.clone())?;
+    let motion = |(row, scan): (usize, &Scan)| {
+        if let Some(given) = expected.filter(|_| row > 0) {
+            odometer.expect(scan, PoseMeaning::Given.motion(given, row - 1, row));
+        }
+        let step = odometer.step(scan)?;
+        let is_registered = step.state == StepState::Registered;
+        Ok((is_registered && is_used(&step)).then_some(step.previous_from_current))
+    };
+    scans.iter().enumerate().map(motion).collect()
 }
 
 /// Compares the motions to scans, as far as they are known, with poses.

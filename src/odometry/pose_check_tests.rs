@@ -1,7 +1,7 @@
 use std::f64::consts::FRAC_PI_2;
 
 use super::*;
-use crate::odometry::tests::{drive, drive_scans};
+use crate::odometry::tests::{World, drive, drive_scans};
 
 /// Poses of the lidar on a curve, ten times per second.
 fn lidar_poses() -> Vec<Pose3> {
@@ -134,4 +134,23 @@ fn scans_of_a_drive_confirm_its_poses_and_refuse_those_of_a_camera() {
     let wrong = check(&camera);
     assert_eq!(wrong.fit, PoseFit::Wrong);
     assert_eq!(wrong.better.unwrap().0, PoseMeaning::Camera);
+}
+
+#[test]
+fn poses_along_a_tunnel_are_not_refused_for_rings_that_move_with_the_sensor() {
+    let poses: Vec<Pose3> = (0..16)
+        .map(|row| Pose3::translation(1.5 * f64::from(row), 0.0, 0.0))
+        .collect();
+    let scans = World::tunnel().scans(&poses);
+    let given = GivenPoses {
+        map_from_lidar: &poses,
+        world_from_map: Pose3::identity(),
+        body_from_lidar: Pose3::identity(),
+    };
+    let config = OdometryConfig::default();
+    // After a few scans the rings themselves are mapped as surfaces, at which the sensor stands.
+    let slipping = super::motions(&scans, None, &config, is_certain).unwrap();
+    assert_eq!(compare(&slipping, &given).unwrap().fit, PoseFit::Wrong);
+    let check = check_poses(&scans, &given, &config).unwrap();
+    assert!(check.is_none(), "{check:?}");
 }

@@ -83,6 +83,15 @@ impl OdometerState {
         self.first.is_some()
     }
 
+    /// Predicts the next scan by a motion.
+    pub fn expect(&mut self, motion: Motion, config: &OdometryConfig) {
+        if let Some(first) = self.first.take() {
+            self.map = self.empty_map(config);
+            self.map.insert(&first.mapped(&self.mapped, Some(&motion)));
+        }
+        self.motion = Some(motion);
+    }
+
     /// Pose after a time at constant velocity, turned as was measured, where it was.
     pub fn predicted(&self, duration_s: f64, turn: Option<UnitQuaternion<f64>>) -> Pose3 {
         let mut motion = (self.motion).map_or(Pose3::identity(), |motion| {

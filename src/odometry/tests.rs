@@ -82,6 +82,20 @@ impl World {
         world
     }
 
+    /// A corridor with a ceiling.
+    pub(super) fn tunnel() -> Self {
+        let mut world = Self::corridor();
+        world.planes.push((Vector3::z(), 4.0, UNBOUNDED));
+        world
+    }
+
+    /// A scan from each pose.
+    pub(super) fn scans(&self, poses: &[Pose3]) -> Vec<Scan> {
+        (poses.iter())
+            .map(|&pose| self.scan(|_| pose, None))
+            .collect()
+    }
+
     /// Range along a ray; `None` beyond 60 m.
     fn cast(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<f64> {
         let mut nearest = 60.0;
@@ -264,13 +278,8 @@ fn large_steps_at_a_low_rate_converge() {
 
 #[test]
 fn a_corridor_does_not_determine_its_own_direction() {
-    let world = World::corridor();
-    let scans: Vec<Scan> = (0..2)
-        .map(|number| {
-            let pose = Pose3::translation(0.3 * f64::from(number), 0.0, 0.0);
-            world.scan(|_| pose, None)
-        })
-        .collect();
+    let poses = [0.0, 0.3].map(|along_m| Pose3::translation(along_m, 0.0, 0.0));
+    let scans = World::corridor().scans(&poses);
     for estimate in &run(&scans)[1..2] {
         let [direction] = estimate.degenerate_directions.as_slice() else {
             panic!("{:?}", estimate.degenerate_directions);
