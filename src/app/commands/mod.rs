@@ -16,5 +16,6 @@ pub mod refine;
 pub mod simulate;
 // What they share.
 pub mod motion_source;
+pub mod pose_remedy;
 pub mod stages;
 pub mod trajectory;

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use rand::Rng;
 
+use super::pose_remedy::remedy;
 use super::stages::RecordingInputs;
 use crate::app::settings::{MotionSourceConfig, OdometrySource};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
@@ -89,8 +90,9 @@ impl MotionSource {
         let report = PoseReport::of_motion(recording, Some(track))?;
         if report.fit() != PoseFit::Fits {
             tracing::warn!(
-                "the poses of {} and the scans contradict each other, so that the motion of the scans is used: {report}; correct the poses, or leave them out",
-                track.path.display()
+                "the poses of {} and the scans contradict each other, so that the motion of the scans is used: {report}{}, or leave the poses out",
+                track.path.display(),
+                remedy(&report, "odometry_file")
             );
             return Ok(Self::of_scans(recording));
         }

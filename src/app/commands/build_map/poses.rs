@@ -8,6 +8,7 @@ use anyhow::{Context as _, Result, ensure};
 
 use super::older::OlderMap;
 use super::parts::{Role, not_listed};
+use crate::app::commands::pose_remedy::remedy;
 use crate::app::commands::stages::RecordingInputs;
 use crate::app::commands::trajectory::{self, poses_next_to};
 use crate::app::report::odometry;
@@ -18,7 +19,7 @@ use crate::app::settings::BuildMapConfig;
 use crate::geometry::StampedPose;
 use crate::map::PoseSource;
 use crate::mapping::{self, MappingError, PoseReport, PoseSearch, TrajectorySummary};
-use crate::odometry::{PoseFit, PoseMeaning};
+use crate::odometry::PoseFit;
 use crate::recording::poses::{read_tum, write_exact_tum};
 use crate::recording::{Frame, Recording};
 use crate::sensor::{Sensor, SensorConfig};
@@ -145,7 +146,10 @@ fn inputs(search: &PoseSearch, localized_by: &str) -> Result<String> {
 fn warn_of(report: &PoseReport) {
     match report.fit() {
         PoseFit::Fits => tracing::debug!("the poses fit the scans: {report}"),
-        _ => tracing::warn!("the poses fit the scans badly: {report}{}", remedy(report)),
+        _ => tracing::warn!(
+            "the poses fit the scans badly: {report}{}",
+            remedy(report, "pose_file")
+        ),
     }
     match report.tilt {
         Some(tilt) if tilt.is_uneven() => tracing::warn!(
@@ -165,24 +169,9 @@ fn explained(error: MappingError, origin: Option<String>) -> anyhow::Error {
     let origin = origin.unwrap_or_default();
     match &error {
         MappingError::PosesDoNotFit(report) => {
-            anyhow::anyhow!("{error}{}", remedy(report)).context(origin)
+            anyhow::anyhow!("{error}{}", remedy(report, "pose_file")).context(origin)
         }
         MappingError::Path(_) => anyhow::Error::from(error).context(origin),
         _ => error.into(),
-    }
-}
-
-/// What to change in the configuration.
-fn remedy(report: &PoseReport) -> String {
-    match report.better() {
-        None | Some(PoseMeaning::Given) => "; check that pose_file belongs to this recording, and that calib_file or body_from_lidar describe the body whose poses it has".to_owned(),
-        Some(PoseMeaning::Camera) => ": give calib_file with the line Tr".to_owned(),
-        Some(PoseMeaning::Lidar) => ": remove calib_file and body_from_lidar".to_owned(),
-        Some(PoseMeaning::Inverse) => ": invert the rows of pose_file".to_owned(),
-        Some(PoseMeaning::Mirrored) => ": negate y, roll and yaw in the rows of pose_file".to_owned(),
-        Some(PoseMeaning::Turned(rad)) => format!(
-            ": give body_from_lidar with a yaw of {:.0} degrees",
-            rad.to_degrees()
-        ),
     }
 }
