@@ -154,7 +154,7 @@ impl<T: Pod + fmt::Debug> fmt::Debug for Column<T> {
 /// An item of a column, as a row of `N` numbers.
 pub trait Row<const N: usize>: Sized {
     /// Type of the numbers in the file.
-    type Number: AutoSerialize + Copy;
+    type Number: AutoSerialize + Pod;
     /// Number in the rows before the first localized frame.
     const EMPTY: Self::Number;
 

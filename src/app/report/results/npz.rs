@@ -4,10 +4,11 @@
 
 use std::fmt::Display;
 use std::fs::File;
-use std::io::{self, BufReader, BufWriter, Read, Write};
+use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
 use anyhow::{Context as _, Result, anyhow, ensure};
+use bytemuck::Pod;
 use npyz::{AutoSerialize, DType, Deserialize, NpyFile, Order, TypeChar, WriterBuilder};
 use zip::ZipArchive;
 use zip::result::ZipError;
@@ -204,20 +205,31 @@ fn numbers<'a, T: Deserialize + 'a>(
     Ok(Box::new(elements.map(move |element| element.map(&convert))))
 }
 
-/// Writes one array in NumPy's format.
-pub fn write_npy<T: AutoSerialize>(
+/// Writes one array in NumPy's format, many numbers at a time: the results of a million frames are hundreds of megabytes,
+/// written after a signal.
+pub fn write_npy<T: AutoSerialize + Pod>(
     writer: impl Write,
     shape: &[usize],
     numbers: impl IntoIterator<Item = T>,
 ) -> io::Result<()> {
-    /// Of the file [bytes]: the results of a million frames are hundreds of megabytes, written after a signal.
-    const BUFFER: usize = 1 << 20;
+    /// Numbers that are written at once.
+    const CHUNK: usize = 1 << 16;
     let shape: Vec<u64> = shape.iter().map(|&extent| extent as u64).collect();
-    let mut array = npyz::WriteOptions::new()
+    let mut writer = npyz::WriteOptions::<T>::new()
         .default_dtype()
         .shape(&shape)
-        .writer(BufWriter::with_capacity(BUFFER, writer))
-        .begin_nd()?;
-    array.extend(numbers)?;
-    array.finish()
+        .writer(writer)
+        .write_header_only()?;
+    let mut chunk: Vec<T> = Vec::with_capacity(CHUNK);
+    let mut write = |chunk: &[T]| writer.write_all(bytemuck::cast_slice(chunk));
+    // From within, iterators of rows are fast.
+    numbers.into_iter().try_for_each(|number| {
+        if chunk.len() == CHUNK {
+            write(&chunk)?;
+            chunk.clear();
+        }
+        chunk.push(number);
+        io::Result::Ok(())
+    })?;
+    write(&chunk)
 }

@@ -8,6 +8,7 @@
 use std::fs::File;
 use std::io::{self, Read as _, Seek, SeekFrom, Write};
 
+use bytemuck::Pod;
 use crc32fast::Hasher;
 use flate2::Compression;
 use flate2::write::DeflateEncoder;
@@ -198,7 +199,7 @@ impl<W: Write + Seek> NpzWriter<W> {
 
     /// Adds an array of a shape with all its numbers in row-major order, not compressed: that would take
     /// long for many frames, and numbers of double precision hardly get smaller.
-    pub fn add<T: AutoSerialize>(
+    pub fn add<T: AutoSerialize + Pod>(
         &mut self,
         name: &str,
         shape: &[usize],
