@@ -62,6 +62,22 @@ pub struct RegistrationConfig {
     /// to 4 mm over tens of meters.
     #[default(0.003)]
     pub map_error_m: f64,
+    /// Standard deviation of the normals of the map, which is no information on the position [rad]: 3 mm over the 9 cm of a
+    /// cell. No key of a configuration.
+    #[default(0.03)]
+    #[serde(skip)]
+    pub normal_rad: f64,
+}
+
+impl RegistrationConfig {
+    /// The same for a pose that is not certain: in a tunnel or on a motorway what the normals of some parts of a map show
+    /// beyond their usual noise would confirm a wrong place.
+    pub(crate) fn cautious(&self) -> Self {
+        Self {
+            normal_rad: 2.0 * self.normal_rad,
+            ..self.clone()
+        }
+    }
 }
 
 impl Validate for RegistrationConfig {
@@ -247,7 +263,7 @@ fn solve(
     let cholesky = information.cholesky()?;
     let step = cholesky.solve(&right_side);
     let outer_products: Matrix6<f64> = sector_gradients.iter().map(|g| g * g.transpose()).sum();
-    let horizontal = Horizontal::new(&information, weights)?;
+    let horizontal = Horizontal::new(&information, weights * config.normal_rad.powi(2))?;
     let inverse = horizontal.corrected(&information).try_inverse()?;
     let step = horizontal.determined(step);
     let mut covariance = inverse * (squares / weights) + inverse * outer_products * inverse;
@@ -270,16 +286,14 @@ struct Horizontal {
 }
 
 impl Horizontal {
-    /// Splits the information of residuals with a sum of weights; `None` if it is singular.
-    fn new(information: &Matrix6<f64>, weights: f64) -> Option<Self> {
-        /// Standard deviation of a normal: 3 mm over the 9 cm of a cell [rad].
-        const NORMAL_RAD: f64 = 0.03;
+    /// Splits the information of residuals, of which noise has some in each direction; `None` if it is singular.
+    fn new(information: &Matrix6<f64>, noise: f64) -> Option<Self> {
         /// Share of its information that a direction keeps at least, so that the matrix stays positive definite.
         const LEAST: f64 = 1e-3;
         let covariance = information.try_inverse()?;
         let horizontal = covariance.fixed_view::<2, 2>(0, 0).into_owned();
         let eigen = horizontal.try_inverse()?.symmetric_eigen();
-        let kept = |found: f64| (found - weights * NORMAL_RAD.powi(2)).max(LEAST * found);
+        let kept = |found: f64| (found - noise).max(LEAST * found);
         Some(Self {
             directions: eigen.eigenvectors,
             found: eigen.eigenvalues,
@@ -366,11 +380,19 @@ mod tests {
 
     #[test]
     fn noise_of_normals_along_a_tunnel_is_no_information() {
-        // Walls along x, a floor and a ceiling, whose normals have a noise of 0.02 rad.
+        let usual = RegistrationConfig::default();
+        // Normals with a noise of 0.02 rad, and for poses that are not certain of 0.05 rad.
+        for (amplitude_rad, config) in [(0.028, &usual), (0.07, &usual.cautious())] {
+            along_a_tunnel_nothing_is_known(amplitude_rad, config.normal_rad);
+        }
+    }
+
+    /// Checks the information of walls along x, a floor and a ceiling, whose normals have some noise.
+    fn along_a_tunnel_nothing_is_known(amplitude_rad: f64, normal_rad: f64) {
         let mut information = Matrix6::zeros();
         for k in 0..1200 {
             let (sine, cosine) = (0.3 * f64::from(k)).sin_cos();
-            let noise = Vector6::new(0.028 * sine, 0.0, 0.0, 0.0, 0.0, 0.0);
+            let noise = Vector6::new(amplitude_rad * sine, 0.0, 0.0, 0.0, 0.0, 0.0);
             let lever = 20.0 * cosine;
             let jacobian = match k % 2 {
                 0 => Vector6::new(0.0, 1.0, 0.0, 1.5 * sine, 0.0, lever),
@@ -378,7 +400,7 @@ mod tests {
             } + noise;
             information += jacobian * jacobian.transpose();
         }
-        let horizontal = Horizontal::new(&information, 1200.0).unwrap();
+        let horizontal = Horizontal::new(&information, 1200.0 * normal_rad.powi(2)).unwrap();
         let sigma = |information: &Matrix6<f64>, axis: usize| {
             information.try_inverse().unwrap()[(axis, axis)].sqrt()
         };

@@ -3,6 +3,7 @@
 
 use rand::Rng;
 
+use super::phase::Phase;
 use super::reweight::Update;
 use super::state::ParticleFilter;
 use crate::geometry::{Pose3, pose2_from_pose3};
@@ -76,8 +77,11 @@ impl ParticleFilter {
         let mut choose = |count| choose_beams(scan, count, config.road_share, attitude, rng);
         let (beams, weighed_beams) = (choose(config.beams), choose(config.weighed_beams));
         let start = patch.lift(&mean, attitude);
-        let Some(found) = register(&*self.map.renderer, &beams, &start, &config.registration)?
-        else {
+        let registration = match self.phase {
+            Phase::Tracking => &config.registration,
+            _ => &config.registration.cautious(),
+        };
+        let Some(found) = register(&*self.map.renderer, &beams, &start, registration)? else {
             return Ok(None);
         };
         let prior = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)));

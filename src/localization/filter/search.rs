@@ -141,7 +141,7 @@ impl ParticleFilter {
                 [&beams, &beams],
                 &lifted,
                 WIDE_KERNEL_M,
-                &config.registration,
+                &config.registration.cautious(),
                 |pose| is_same(&start, &pose2_from_pose3(pose), radius_m),
             )?;
             let covariance = (found.as_ref()).map(RegistrationResult::planar_covariance);

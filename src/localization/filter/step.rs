@@ -170,6 +170,7 @@ impl ParticleFilter {
             is_confirmed: self.agreement.confirm(is_converged, agreement, config),
             are_alike: agreement >= Some(config.min_agreement) && self.compares_places(),
             is_precise: self.is_precise(&estimate.covariance),
+            is_twice_as_precise: self.is_precise(&(estimate.covariance * 4.0)),
             is_usual: self.agreement.is_usual(agreement, config),
         }
     }
