@@ -7,7 +7,6 @@ use std::path::Path;
 use anyhow::Result;
 
 use super::super::motion_source::MotionSource;
-use super::super::pose_remedy::remedy;
 use super::super::stages::{RecordingInputs, input_files};
 use super::gnss_start;
 use crate::app::report::RunFiles;
@@ -17,7 +16,6 @@ use crate::app::settings::{LocalizationConfig, NPZ, OdometrySource};
 use crate::file_path::FilePath;
 use crate::lidar::Scan;
 use crate::map::Map;
-use crate::mapping::PoseReport;
 use crate::random::stream;
 use crate::recording::Recording;
 use crate::sensor::Sensor;
@@ -68,9 +66,6 @@ pub fn open(
     gnss_start::resolve(&mut resolved, &map, &recording)?;
     let odometry = config.tracker.odometry.clone().unwrap_or_default();
     let recording = (config.inertial).open_calibrated(recording, &odometry, context)?;
-    if let Some(file) = &config.given_poses.pose_file {
-        warn_of_truth(file, &recording)?;
-    }
     let mut rng = stream(config.tracker.seed, ODOMETRY_STREAM);
     let (motion, odometry_file) =
         MotionSource::open(&config.motion, &inputs, &recording, &mut rng)?;
@@ -83,20 +78,6 @@ pub fn open(
         sensor: Some(sensor),
     };
     Ok((opened, motion, claims))
-}
-
-/// Warns where the true poses have the motion of the scans, but as poses of something else, such as of a camera: all errors
-/// would be wrong.
-fn warn_of_truth(file: &FilePath, recording: &Recording) -> Result<()> {
-    let report = PoseReport::of_motion(recording, None)?;
-    if report.better().is_some() {
-        tracing::warn!(
-            "errors are wrong, since the true poses of {} do not fit the scans: {report}{}",
-            file.display(),
-            remedy(&report, "pose_file")
-        );
-    }
-    Ok(())
 }
 
 /// Opens the map for scans that a robot sends, as [`open`] does for those of a recording.
