@@ -126,15 +126,16 @@ impl Odometer {
         Ok(estimate)
     }
 
-    /// Predicts the next scan by a motion instead of constant velocity.
-    pub(super) fn expect(&mut self, scan: &Scan, previous_from_current: Pose3) {
+    /// Sets the motion to the next scan by which it is predicted, instead of constant velocity. What is wrong with its time
+    /// is reported by [`step`](Self::step).
+    pub(super) fn set_motion(&mut self, scan: &Scan, previous_from_current: Pose3) {
         let duration_s = self.duration_until(scan);
         if let (Some(state), Ok(duration_s)) = (&mut self.state, duration_s) {
             let motion = Motion {
                 previous_from_current,
                 duration_s,
             };
-            state.expect(motion, &self.config);
+            state.set_motion(motion, &self.config);
         }
     }
 

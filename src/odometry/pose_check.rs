@@ -153,7 +153,8 @@ pub struct PoseCheck {
     pub better: Option<(PoseMeaning, MotionDifference)>,
 }
 
-/// Checks poses against scans, about ten in succession; `None` if the sensor stands or its motion is uncertain.
+/// Checks poses against scans, about ten in succession; `None` if the sensor stands, its motion is uncertain, or the scans
+/// fit both the poses and another motion.
 ///
 /// Where the scans show another motion, they are registered again, each from the given one. In a tunnel they fit there, too:
 /// the rings of the beams look alike wherever the sensor is, so that the scans show no motion.
@@ -176,7 +177,8 @@ fn is_certain(step: &OdometryEstimate) -> bool {
     step.degenerate_directions.is_empty()
 }
 
-/// The motion to each scan, where it was registered and is used; expected is that of poses, where some are given.
+/// The motion to each scan that is registered and passes `is_used`. With `expected`, each scan is predicted by the motion of
+/// these poses instead of constant velocity.
 fn motions(
     scans: &[Scan],
     expected: Option<&GivenPoses>,
@@ -186,7 +188,7 @@ fn motions(
     let mut odometer = Odometer::new(config.clone())?;
     let motion = |(row, scan): (usize, &Scan)| {
         if let Some(given) = expected.filter(|_| row > 0) {
-            odometer.expect(scan, PoseMeaning::Given.motion(given, row - 1, row));
+            odometer.set_motion(scan, PoseMeaning::Given.motion(given, row - 1, row));
         }
         let step = odometer.step(scan)?;
         let is_registered = step.state == StepState::Registered;

@@ -83,11 +83,10 @@ impl OdometerState {
         self.first.is_some()
     }
 
-    /// Predicts the next scan by a motion.
-    pub fn expect(&mut self, motion: Motion, config: &OdometryConfig) {
+    /// Sets the motion by which the next scan is predicted.
+    pub fn set_motion(&mut self, motion: Motion, config: &OdometryConfig) {
         if let Some(first) = self.first.take() {
-            self.map = self.empty_map(config);
-            self.map.insert(&first.mapped(&self.mapped, Some(&motion)));
+            self.map = self.map_of(&first, Some(&motion), config);
         }
         self.motion = Some(motion);
     }
@@ -297,8 +296,7 @@ impl OdometerState {
                 previous_from_current: self.mapped.inverse() * found.odom_from_lidar,
                 duration_s: problem.observation.duration_s,
             };
-            let mut map = self.empty_map(config);
-            map.insert(&first.mapped(&self.mapped, Some(&motion)));
+            let map = self.map_of(first, Some(&motion), config);
             let observation = Observation {
                 map: &map,
                 ..problem.observation
@@ -369,8 +367,7 @@ impl OdometerState {
             duration_s: since_s,
         };
         if let Some(first) = self.first.take() {
-            self.map = self.empty_map(config);
-            self.map.insert(&first.mapped(&self.mapped, Some(&motion)));
+            self.map = self.map_of(&first, Some(&motion), config);
             self.cost = found.cost;
         } else {
             let deviation = predicted.inverse() * found.odom_from_lidar;
@@ -416,9 +413,7 @@ impl OdometerState {
         self.mapped = self.odom_from_lidar;
         self.waited_s = 0.0;
         self.missed = 0;
-        self.map = self.empty_map(config);
-        self.map
-            .insert(&sample.mapped(&self.mapped, self.motion.as_ref()));
+        self.map = self.map_of(&sample, self.motion.as_ref(), config);
         self.first = Some(sample);
     }
 
@@ -446,6 +441,13 @@ impl OdometerState {
 
     fn voxel_m(&self, config: &OdometryConfig) -> f64 {
         config.voxel_share * self.range_m
+    }
+
+    /// The local map of one scan at the last pose, compensated by a motion.
+    fn map_of(&self, scan: &Sample, motion: Option<&Motion>, config: &OdometryConfig) -> VoxelMap {
+        let mut map = self.empty_map(config);
+        map.insert(&scan.mapped(&self.mapped, motion));
+        map
     }
 
     fn empty_map(&self, config: &OdometryConfig) -> VoxelMap {
