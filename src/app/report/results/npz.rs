@@ -207,6 +207,9 @@ fn numbers<'a, T: Deserialize + 'a>(
 
 /// Writes one array in NumPy's format, many numbers at a time: the results of a million frames are hundreds of megabytes,
 /// written after a signal.
+///
+/// # Errors
+/// The numbers are not as many as the shape has, or cannot be written.
 pub fn write_npy<T: AutoSerialize + Pod>(
     writer: impl Write,
     shape: &[usize],
@@ -221,8 +224,12 @@ pub fn write_npy<T: AutoSerialize + Pod>(
         .writer(writer)
         .write_header_only()?;
     let mut chunk: Vec<T> = Vec::with_capacity(CHUNK);
-    let mut write = |chunk: &[T]| writer.write_all(bytemuck::cast_slice(chunk));
-    // From within, iterators of rows are fast.
+    let mut written = 0;
+    let mut write = |chunk: &[T]| {
+        written += chunk.len() as u64;
+        writer.write_all(bytemuck::cast_slice(chunk))
+    };
+    // Internal iteration: `next` of flattened rows is slow.
     numbers.into_iter().try_for_each(|number| {
         if chunk.len() == CHUNK {
             write(&chunk)?;
@@ -231,5 +238,12 @@ pub fn write_npy<T: AutoSerialize + Pod>(
         chunk.push(number);
         io::Result::Ok(())
     })?;
-    write(&chunk)
+    write(&chunk)?;
+    let expected: u64 = shape.iter().product();
+    if written == expected {
+        Ok(())
+    } else {
+        let problem = format!("{written} numbers for an array of {expected}");
+        Err(io::Error::new(io::ErrorKind::InvalidData, problem))
+    }
 }

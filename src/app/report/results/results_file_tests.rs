@@ -133,6 +133,22 @@ fn the_same_results_give_the_same_bytes() {
 }
 
 #[test]
+fn an_array_whose_numbers_are_not_as_many_as_its_shape_has_is_an_error() {
+    let write = |count: usize| {
+        let mut npy = Vec::new();
+        let numbers = (0..count).map(|number| number as f64);
+        super::npz::write_npy(&mut npy, &[100_000, 2], numbers).map(|()| npy)
+    };
+    let file = NpyFile::new(&*write(200_000).unwrap())
+        .unwrap()
+        .into_vec::<f64>();
+    assert!(file.unwrap().into_iter().eq((0..200_000).map(f64::from)));
+    for count in [0, 199_999, 200_001] {
+        assert!(write(count).is_err(), "{count}");
+    }
+}
+
+#[test]
 fn a_late_first_frame_needs_no_empty_rows_of_gigabytes() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("results.npz");
