@@ -89,10 +89,11 @@ impl MotionSource {
     fn of_track(track: &PoseTrack, recording: &Recording) -> Result<Self> {
         let report = PoseReport::of_motion(recording, Some(track))?;
         if report.fit() != PoseFit::Fits {
+            // A topic of a bag has no key.
+            let poses = track.path.display().to_string();
             tracing::warn!(
-                "the poses of {} and the scans contradict each other, so that the motion of the scans is used: {report}{}, or leave the poses out",
-                track.path.display(),
-                remedy(&report, "odometry_file")
+                "the poses of {poses} and the scans contradict each other, so that the motion of the scans is used: {report}{}, or leave the poses out",
+                remedy(&report, &poses)
             );
             return Ok(Self::of_scans(recording));
         }
