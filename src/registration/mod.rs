@@ -62,16 +62,16 @@ pub struct RegistrationConfig {
     /// to 4 mm over tens of meters.
     #[default(0.003)]
     pub map_error_m: f64,
-    /// Standard deviation of the normals of the map, which is no information on the position [rad]: 3 mm over the 9 cm of a
-    /// cell. No key of a configuration.
+    /// Standard deviation of the normals of the map, whose noise is no information on the position [rad]. The default is 3 mm
+    /// over the 9 cm of a cell. It is no key of a configuration.
     #[default(0.03)]
     #[serde(skip)]
     pub normal_rad: f64,
 }
 
 impl RegistrationConfig {
-    /// The same for a pose that is not certain: in a tunnel or on a motorway what the normals of some parts of a map show
-    /// beyond their usual noise would confirm a wrong place.
+    /// The settings for a pose that is not certain, with twice the noise of the normals: where they are noisier than usual,
+    /// as on parts of a tunnel or of a motorway, they would confirm a wrong place.
     pub(crate) fn cautious(&self) -> Self {
         Self {
             normal_rad: 2.0 * self.normal_rad,
@@ -86,7 +86,8 @@ impl Validate for RegistrationConfig {
         positive("kernel_m", self.kernel_m)?;
         not_negative("tolerance_m", self.tolerance_m)?;
         in_range("sectors", self.sectors, 1..=10_000)?;
-        not_negative("map_error_m", self.map_error_m)
+        not_negative("map_error_m", self.map_error_m)?;
+        not_negative("normal_rad", self.normal_rad)
     }
 }
 
@@ -286,7 +287,8 @@ struct Horizontal {
 }
 
 impl Horizontal {
-    /// Splits the information of residuals, of which noise has some in each direction; `None` if it is singular.
+    /// Splits the information of residuals; `noise` is the part of each direction that is not information. `None` if it is
+    /// singular.
     fn new(information: &Matrix6<f64>, noise: f64) -> Option<Self> {
         /// Share of its information that a direction keeps at least, so that the matrix stays positive definite.
         const LEAST: f64 = 1e-3;

@@ -15,8 +15,8 @@
 //! Lost       panoramas resemble the scan                     Searching  restart, within the same frame
 //! ```
 //!
-//! In a tunnel the standard deviation along it goes up and down by the noise of the walls, about the limit at which it became
-//! uncertain; a place that shows the position makes it a hundredth of that within a scan.
+//! Twice as precise, since in a tunnel the standard deviation of the position crosses its limit again and again by the noise of
+//! the walls. A scan that determines the position reduces it to centimetres at once.
 //!
 //! Thresholds: [`tracking_loss`](crate::localization::tracking_loss), [`convergence`](crate::localization::convergence),
 //! and for what is searched [`places`](crate::localization::places).
@@ -75,7 +75,7 @@ pub(super) struct Evidence {
     pub are_alike: bool,
     /// The standard deviation of the position is at most `sure_spread_m`.
     pub is_precise: bool,
-    /// It is at most half of that.
+    /// The standard deviation of the position is at most half of `sure_spread_m`.
     pub is_twice_as_precise: bool,
     /// The agreement is as large as usual here.
     pub is_usual: bool,
@@ -307,8 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn an_uncertain_pose_is_tracked_again_only_if_it_is_twice_as_precise_and_as_many_beams_agree_as_usual()
-     {
+    fn an_uncertain_pose_is_tracked_again_only_if_twice_as_precise_and_in_usual_agreement() {
         for update in evidence() {
             let after = Phase::Uncertain.after(&update, PATIENCE);
             let is_lost = update.disagrees || update.is_scattered;

@@ -128,6 +128,7 @@ impl ParticleFilter {
         const WIDE_KERNEL_M: f64 = 0.4;
         let config = &self.config.proposal;
         let beams = choose_beams(scan, BEAMS, config.road_share, attitude, rng);
+        let registration = config.registration.cautious();
         let radius_m = self.config.places.radius_m;
         let place = |&seed: &usize| {
             let particle = &self.particles.particles()[seed];
@@ -141,7 +142,7 @@ impl ParticleFilter {
                 [&beams, &beams],
                 &lifted,
                 WIDE_KERNEL_M,
-                &config.registration.cautious(),
+                &registration,
                 |pose| is_same(&start, &pose2_from_pose3(pose), radius_m),
             )?;
             let covariance = (found.as_ref()).map(RegistrationResult::planar_covariance);
