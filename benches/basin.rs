@@ -262,11 +262,11 @@ impl RangeRenderer for Counting {
     fn surfaces(
         &self,
         pose: &Pose3,
-        directions: &[Vec3],
-        until_m: f32,
+        beams: &[Beam],
+        within_m: f32,
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
-        self.count(directions.len());
-        self.inner.surfaces(pose, directions, until_m)
+        self.count(beams.len());
+        self.inner.surfaces(pose, beams, within_m)
     }
 
     fn compare(

@@ -2,6 +2,9 @@
 
 mod cast;
 
+#[cfg(test)]
+pub(super) use cast::Single;
+
 use std::convert::Infallible;
 use std::fmt::Debug;
 use std::sync::Arc;

@@ -1,6 +1,7 @@
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
+use super::scene::Single;
 use super::*;
 use crate::geometry::{TriangleMesh, Vec3};
 #[cfg(target_arch = "x86_64")]
@@ -437,10 +438,10 @@ fn coinciding_or_converging_centroids_do_not_exceed_the_depth_limit() {
 
 /// Ranges of single rays from one origin.
 fn cast_single(scene: &Scene, origin: Vec3, directions: &[Vec3], reach: Reach) -> Vec<f32> {
-    let mut ranges_m = vec![0.0; directions.len()];
+    let mut hits = vec![Hit::MISS; directions.len()];
     let reaches = vec![reach; directions.len()];
-    let Ok(()) = scene.cast_single(origin.as_dvec3(), directions, &reaches, &mut ranges_m);
-    ranges_m
+    let Ok(()) = scene.cast_single(origin.as_dvec3(), directions, &reaches, &mut hits);
+    hits.iter().map(|hit| hit.range_m).collect()
 }
 
 #[test]
@@ -550,11 +551,11 @@ fn every_instruction_set_gives_single_rays_the_same_bits() {
         let origin = in_cube(&mut rng);
         let directions: Vec<Vec3> = (0..2000).map(|_| direction(&mut rng)).collect();
         let reaches = vec![reach; directions.len()];
-        let mut ranges_m = vec![0.0; directions.len()];
+        let mut hits = vec![Hit::MISS; directions.len()];
         expect_the_same(|set| {
-            let Ok(()) =
-                set.run(scene.task(origin.as_dvec3(), &directions, &reaches, &mut ranges_m));
-            ranges_m.clone()
+            let origin = Single(origin.as_dvec3());
+            let Ok(()) = set.run(scene.task(origin, &directions, &reaches, &mut hits));
+            hits.clone()
         });
     }
 }

@@ -424,10 +424,10 @@ mod tests {
         fn surfaces(
             &self,
             pose: &Pose3,
-            directions: &[Vec3],
-            until_m: f32,
+            beams: &[Beam],
+            within_m: f32,
         ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
-            self.surfaces.surfaces(pose, directions, until_m)
+            self.surfaces.surfaces(pose, beams, within_m)
         }
 
         fn compare(

@@ -32,7 +32,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::geometry::pose::exponential;
-use crate::geometry::{Pose3, Rigid3f, RobustKernel, Vec3, azimuth_sector};
+use crate::geometry::{Pose3, Rigid3f, RobustKernel, azimuth_sector};
 use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
@@ -135,11 +135,10 @@ pub(crate) fn register(
 ) -> Result<Option<RegistrationResult>, RenderError> {
     /// Lever of rotations [m].
     const LEVER_M: f64 = 10.0;
-    let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
     let mut pose = *initial;
     let mut result = None;
     for iteration in 1..=config.iterations {
-        let residuals = linearize(renderer, beams, &directions, &pose, config)?;
+        let residuals = linearize(renderer, beams, &pose, config)?;
         let Some((step, covariance)) = solve(&residuals, config) else {
             return Ok(None);
         };
@@ -185,20 +184,17 @@ pub(crate) fn register_coarse_to_fine(
     Ok(result)
 }
 
-/// Gate on the distance along the beam, in kernel widths, for grazing incidence.
-const GATE_ALONG: f64 = 20.0;
-
 /// Linearized residuals of all beams that pass the gates.
 fn linearize(
     renderer: &dyn RangeRenderer,
     beams: &[Beam],
-    directions: &[Vec3],
     pose: &Pose3,
     config: &RegistrationConfig,
 ) -> Result<Vec<Residual>, RenderError> {
-    let farthest_m = beams.iter().map(|beam| beam.range_m).fold(0.0, f32::max);
-    let until_m = farthest_m + (GATE_ALONG * config.kernel_m) as f32;
-    let hits = renderer.surfaces(pose, directions, until_m)?;
+    /// Gate on the distance along the beam, in kernel widths, for grazing incidence.
+    const GATE_ALONG: f64 = 20.0;
+    let within_m = (GATE_ALONG * config.kernel_m) as f32;
+    let hits = renderer.surfaces(pose, beams, within_m)?;
     let lidar_from_map = Rigid3f::from(&pose.inverse());
     let residual = |(beam, hit): (&Beam, &Option<SurfaceHit>)| {
         residual(beam, hit.as_ref()?, &lidar_from_map, config)
@@ -206,7 +202,7 @@ fn linearize(
     Ok(beams.iter().zip(&hits).filter_map(residual).collect())
 }
 
-/// The linearized residual of one beam; `None` if its return is too far from the hit to be a
+/// The linearized residual of one beam; `None` if its return is too far from the plane of the hit to be a
 /// correspondence.
 fn residual(
     beam: &Beam,
@@ -219,9 +215,7 @@ fn residual(
     let normal = lidar_from_map.rotate(hit.normal_in_map);
     let excess_m = f64::from(beam.range_m - hit.range_m);
     let value_m = excess_m * f64::from(normal.dot(beam.direction));
-    if value_m.abs() > GATE_ACROSS * config.kernel_m
-        || excess_m.abs() > GATE_ALONG * config.kernel_m
-    {
+    if value_m.abs() > GATE_ACROSS * config.kernel_m {
         return None;
     }
     let lever = beam.point().cross(normal);

@@ -20,7 +20,7 @@ use super::order::{
     bundle_width_m, coherent_order, packet_width_m, pixel_order, pose_order, poses_by_square,
 };
 
-use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit, facing};
+use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit, facing, is_near_end};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::raycasting::{Hit, RAYS, Reach, Scene, SceneSource, TileError};
@@ -113,9 +113,11 @@ impl CpuRenderer {
                 let rays = pieces[number / groups.len()];
                 let group = groups[number % groups.len()];
                 let ranges = match grouping {
-                    Grouping::Packets => vec![cast_packets(scene, &group[0], rays, beams)?],
                     Grouping::Bundles => cast_bundles(scene, group, rays, beams)?,
-                    Grouping::Single => vec![cast_single(scene, &group[0], rays, beams)?],
+                    _ => {
+                        let hits = hits(scene, &group[0], rays, beams, grouping)?;
+                        vec![hits.iter().map(|hit| hit.range_m).collect()]
+                    }
                 };
                 let summaries = ranges.iter().map(|ranges| summarize(rays, ranges));
                 Ok(summaries.collect())
@@ -142,12 +144,7 @@ impl CpuRenderer {
         if beams.is_empty() {
             return Ok(vec![0.0; map_from_lidar.len()]);
         }
-        let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
-        let to_cast = CastBeams {
-            order: coherent_order(&directions),
-            reaches: beams.iter().map(reach).collect(),
-            directions,
-        };
+        let to_cast = CastBeams::new(beams, reach);
         let sums = self.map_pieces(map_from_lidar, &to_cast, |rays, ranges| {
             let costs = rays
                 .iter()
@@ -179,43 +176,22 @@ impl CpuRenderer {
     }
 }
 
-/// Nearest hits of some beams of one pose.
+/// Nearest hits of some beams of one pose, in packets or singly.
 fn hits(
     scene: &Scene<TileError>,
     map_from_lidar: &Pose3,
     rays: &[u32],
     beams: &CastBeams,
+    grouping: Grouping,
 ) -> Result<Vec<Hit>, TileError> {
     let (directions, reaches) = beams.in_map(map_from_lidar, rays);
     let mut hits = vec![Hit::MISS; rays.len()];
     let origin = origin_of(map_from_lidar);
-    scene.cast_packets(origin, &directions, &reaches, &mut hits)?;
+    match grouping {
+        Grouping::Single => scene.cast_single(origin, &directions, &reaches, &mut hits)?,
+        _ => scene.cast_packets(origin, &directions, &reaches, &mut hits)?,
+    }
     Ok(hits)
-}
-
-/// Ranges of some beams of one pose.
-fn cast_packets(
-    scene: &Scene<TileError>,
-    map_from_lidar: &Pose3,
-    rays: &[u32],
-    beams: &CastBeams,
-) -> Result<Vec<f32>, TileError> {
-    let hits = hits(scene, map_from_lidar, rays, beams)?;
-    Ok(hits.iter().map(|hit| hit.range_m).collect())
-}
-
-/// Ranges of some beams of one pose.
-fn cast_single(
-    scene: &Scene<TileError>,
-    map_from_lidar: &Pose3,
-    rays: &[u32],
-    beams: &CastBeams,
-) -> Result<Vec<f32>, TileError> {
-    let (directions, reaches) = beams.in_map(map_from_lidar, rays);
-    let mut ranges = vec![f32::INFINITY; rays.len()];
-    let origin = origin_of(map_from_lidar);
-    scene.cast_single(origin, &directions, &reaches, &mut ranges)?;
-    Ok(ranges)
 }
 
 /// Ranges of some beams of up to [`RAYS`] poses, pose by pose.
@@ -281,6 +257,16 @@ struct CastBeams {
 }
 
 impl CastBeams {
+    /// Measured beams, each with its reach.
+    fn new(beams: &[Beam], reach: impl Fn(&Beam) -> Reach) -> Self {
+        let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+        Self {
+            order: coherent_order(&directions),
+            reaches: beams.iter().map(reach).collect(),
+            directions,
+        }
+    }
+
     /// Beams that look for the nearest surface that is nearer than a range [m].
     fn until(directions: &[Vec3], until_m: f32) -> Self {
         Self {
@@ -351,23 +337,28 @@ impl RangeRenderer for CpuRenderer {
     fn surfaces(
         &self,
         map_from_lidar: &Pose3,
-        directions: &[Vec3],
-        until_m: f32,
+        beams: &[Beam],
+        within_m: f32,
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
-        let beams = CastBeams::until(directions, until_m);
+        let difference = RangeDifference::truncated(within_m);
+        let to_cast = CastBeams::new(beams, |beam| deciding_reach(beam, &difference));
+        let grouping = Grouping::of(&[*map_from_lidar], &to_cast);
         let scene = self.scenes.scene(&[origin_of(map_from_lidar)]);
-        let pieces: Vec<Vec<Hit>> = beams
+        let pieces: Vec<Vec<Hit>> = to_cast
             .order
             .par_chunks(RAYS_PER_PIECE)
-            .map(|rays| hits(&scene, map_from_lidar, rays, &beams))
+            .map(|rays| hits(&scene, map_from_lidar, rays, &to_cast, grouping))
             .collect::<Result<_, TileError>>()?;
         let rotation = rotation_of(map_from_lidar);
-        let mut surfaces = vec![None; directions.len()];
-        for (&ray, hit) in beams.order.iter().zip(pieces.into_iter().flatten()) {
-            surfaces[ray as usize] = scene.normal(&hit)?.map(|normal| SurfaceHit {
-                range_m: hit.range_m,
-                normal_in_map: facing(normal, rotation * directions[ray as usize]),
-            });
+        let mut surfaces = vec![None; beams.len()];
+        for (&ray, hit) in to_cast.order.iter().zip(pieces.into_iter().flatten()) {
+            let beam = &beams[ray as usize];
+            if is_near_end(beam, hit.range_m, within_m) {
+                surfaces[ray as usize] = scene.normal(&hit)?.map(|normal| SurfaceHit {
+                    range_m: hit.range_m,
+                    normal_in_map: facing(normal, rotation * beam.direction),
+                });
+            }
         }
         Ok(surfaces)
     }

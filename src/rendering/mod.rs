@@ -47,8 +47,8 @@ pub trait RangeRenderer: Send + Sync {
         until_m: f32,
     ) -> Result<Vec<Vec<f32>>, RenderError>;
 
-    /// Nearest surfaces along unit directions of the lidar frame, with their normals. Surfaces at `until_m` or farther
-    /// do not count.
+    /// The surfaces that measured beams end on: the nearest surface along each, with its normal, if it is not farther than
+    /// `within_m` from the end of the beam.
     ///
     /// By default those of the plane through the ends of three rays that are close together; rays
     /// whose neighbours hit nothing hit nothing here.
@@ -58,21 +58,25 @@ pub trait RangeRenderer: Send + Sync {
     fn surfaces(
         &self,
         map_from_lidar: &Pose3,
-        directions: &[Vec3],
-        until_m: f32,
+        beams: &[Beam],
+        within_m: f32,
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
         /// Angle between the three rays [rad]: two millimetres at two metres.
         const APART_RAD: f32 = 1e-3;
-        let mut bundles = Vec::with_capacity(3 * directions.len());
-        for direction in directions {
+        let farthest_m = beams.iter().map(|beam| beam.range_m).fold(0.0, f32::max);
+        let mut bundles = Vec::with_capacity(3 * beams.len());
+        for Beam { direction, .. } in beams {
             let (aside, above) = direction.any_orthonormal_pair();
             bundles.push(*direction);
             bundles.push((direction + APART_RAD * aside).normalize());
             bundles.push((direction + APART_RAD * above).normalize());
         }
-        let ranges = self.cast(&[*map_from_lidar], &bundles, until_m)?;
+        let ranges = self.cast(&[*map_from_lidar], &bundles, farthest_m + within_m)?;
         let map_from_lidar = Rigid3f::from(map_from_lidar);
-        let surface = |(rays, ranges_m): (&[Vec3], &[f32])| {
+        let surface = |((beam, rays), ranges_m): ((&Beam, &[Vec3]), &[f32])| {
+            if !is_near_end(beam, ranges_m[0], within_m) {
+                return None;
+            }
             let end = |ray: usize| rays[ray] * ranges_m[ray];
             let across = (end(1) - end(0)).cross(end(2) - end(0));
             let normal = across.try_normalize()?;
@@ -82,11 +86,8 @@ pub trait RangeRenderer: Send + Sync {
             })
         };
         let ranges = ranges.first().map_or(&[][..], Vec::as_slice);
-        Ok(bundles
-            .chunks(3)
-            .zip(ranges.chunks(3))
-            .map(surface)
-            .collect())
+        let rays = beams.iter().zip(bundles.chunks(3));
+        Ok(rays.zip(ranges.chunks(3)).map(surface).collect())
     }
 
     /// Mean [`RangeDifference::cost`] of the beams, one number per pose [m]; nothing is kept
@@ -112,6 +113,11 @@ pub trait RangeRenderer: Send + Sync {
         measured: &RangeImage,
         difference: &RangeDifference,
     ) -> Result<Vec<f32>, RenderError>;
+}
+
+/// Whether a surface at a range is not farther than `within_m` from the end of a beam.
+fn is_near_end(beam: &Beam, range_m: f32, within_m: f32) -> bool {
+    (beam.range_m - range_m).abs() <= within_m
 }
 
 /// Surface of the map that a ray hits.

@@ -595,7 +595,7 @@ mod tests {
 
     use super::*;
     use crate::geometry::Pose3;
-    use crate::lidar::LidarModel;
+    use crate::lidar::{Beam, LidarModel};
     use crate::map::ground::elevation::GroundMap;
     use crate::map::{Map, MapCache, MapError, MapOptions};
     use crate::rendering::{Backend, RenderError};
@@ -886,10 +886,14 @@ mod tests {
             fs::write(&tile, bytes).unwrap();
             let map = Map::load(&file, &options()).unwrap();
             let (renderer, ground) = (&*map.renderer, &map.ground);
+            let beam = Beam {
+                direction: Vec3::Y,
+                range_m: 10.0,
+            };
             let failing = |call: &str| -> Option<RenderError> {
                 match call {
                     "cast" => renderer.cast(&[pose], &[Vec3::Y], 50.0).err(),
-                    "surfaces" => renderer.surfaces(&pose, &[Vec3::Y], 50.0).err(),
+                    "surfaces" => renderer.surfaces(&pose, &[beam], 50.0).err(),
                     "render" => renderer.render(&[pose], &LidarModel::default()).err(),
                     "mesh" => map
                         .mesh_near(&[[600.0, 0.0].into()], 10.0, DVec3::ZERO, u64::MAX)

@@ -103,23 +103,23 @@ impl<E: Clone> Scene<E> {
     }
 
     /// Casts single rays from one origin, which is faster than [`Scene::cast_packets`] if they
-    /// diverge, and writes the range of the nearest hit of each: the same, bit by bit, with two
+    /// diverge, and writes the nearest hit of each: the same, bit by bit, with two
     /// exceptions: of surfaces nearer than `Reach::enough_m` it may be another, and so it may be
     /// of the triangles at an edge that the ray passes within rounding. Runs on the calling thread.
     ///
     /// # Errors
-    /// That of a tile that a ray enters.
+    /// That of a tile that a ray enters; the hits are incomplete then.
     ///
     /// # Panics
-    /// If there are not as many reaches or ranges as directions.
+    /// If there are not as many reaches or hits as directions.
     pub fn cast_single(
         &self,
         origin: DVec3,
         directions: &[Vec3],
         reaches: &[Reach],
-        ranges_m: &mut [f32],
+        hits: &mut [Hit],
     ) -> Result<(), E> {
-        dispatch(self.task(origin, directions, reaches, ranges_m))
+        dispatch(self.task(Single(origin), directions, reaches, hits))
     }
 
     pub(in crate::raycasting) fn task<'a, O, D, R>(
@@ -237,6 +237,9 @@ pub(in crate::raycasting) struct CastTask<'a, E, O, D, R> {
     results: &'a mut [R],
 }
 
+/// Origin of rays that are not cast together.
+pub(in crate::raycasting) struct Single(pub DVec3);
+
 /// Packets of neighbouring directions.
 impl<E: Clone> SimdTask for CastTask<'_, E, DVec3, Vec3, Hit> {
     type Output = Result<(), E>;
@@ -281,15 +284,15 @@ impl<E: Clone> SimdTask for CastTask<'_, E, [DVec3; RAYS], [Vec3; RAYS], [f32; R
 }
 
 /// Single rays.
-impl<E: Clone> SimdTask for CastTask<'_, E, DVec3, Vec3, f32> {
+impl<E: Clone> SimdTask for CastTask<'_, E, Single, Vec3, Hit> {
     type Output = Result<(), E>;
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Result<(), E> {
         let mut stacks = stacks();
         let rays = self.directions.iter().zip(self.reaches);
-        for ((&direction, &reach), range_m) in rays.zip(self.results) {
-            let mut ray = SingleRay::new(self.origin, direction, reach);
+        for ((&direction, &reach), hit) in rays.zip(self.results) {
+            let mut ray = SingleRay::new(self.origin.0, direction, reach);
             if reach.is_window {
                 ray = ray.between(reach.enough_m, reach.until_m);
             }
@@ -303,7 +306,7 @@ impl<E: Clone> SimdTask for CastTask<'_, E, DVec3, Vec3, f32> {
                 ray = ray.between(0.0, reach.enough_m);
                 is_last = true;
             }
-            *range_m = ray.range_m;
+            *hit = self.scene.hit(ray.range_m, ray.place)?;
         }
         Ok(())
     }

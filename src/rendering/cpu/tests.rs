@@ -172,6 +172,41 @@ fn a_cast_along_the_pixels_is_the_image() {
     );
 }
 
+/// Beams along directions, five metres long.
+fn beams_along(directions: &[Vec3]) -> Vec<Beam> {
+    let beam = |&direction| Beam {
+        direction,
+        range_m: 5.0,
+    };
+    directions.iter().map(beam).collect()
+}
+
+#[test]
+fn only_surfaces_near_the_ends_of_beams_are_found() {
+    let wall = |x: f32| TriangleMesh {
+        vertices: [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
+            .map(|(y, z)| Vec3::new(x, y, z))
+            .to_vec(),
+        triangles: vec![[0, 1, 2], [0, 2, 3]],
+        ..TriangleMesh::default()
+    };
+    let renderer = CpuRenderer::new(&[wall(5.0), wall(8.0)]);
+    let found = |range_m: f32, within_m: f32| {
+        let beam = Beam {
+            direction: Vec3::X,
+            range_m,
+        };
+        let surfaces = renderer.surfaces(&Pose3::identity(), &[beam], within_m);
+        surfaces.unwrap()[0].map(|hit| hit.range_m)
+    };
+    assert_eq!(found(4.0, 1.5), Some(5.0));
+    assert_eq!(found(6.0, 1.5), Some(5.0));
+    assert_eq!(found(3.0, 1.5), None);
+    // The far wall is hidden by the near one.
+    assert_eq!(found(8.0, 1.5), None);
+    assert_eq!(found(8.0, 4.0), Some(5.0));
+}
+
 #[test]
 fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
     let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
@@ -185,7 +220,7 @@ fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
     let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), quarter);
     // Ahead of the turned sensor is +y of the map, so +x is on its right.
     let surfaces = renderer
-        .surfaces(&pose, &[Vec3::NEG_Y, Vec3::Y], f32::INFINITY)
+        .surfaces(&pose, &beams_along(&[Vec3::NEG_Y, Vec3::Y]), f32::INFINITY)
         .unwrap();
     let hit = surfaces[0].unwrap();
     assert!((hit.range_m - 4.0).abs() < 1e-6);
@@ -243,11 +278,10 @@ fn normals_from_three_rays_are_those_of_the_triangles() {
     let turned = UnitQuaternion::from_euler_angles(0.1, -0.2, 0.3);
     let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), turned);
     let directions = [Vec3::X, Vec3::new(0.8, 0.6, 0.0), Vec3::NEG_X, Vec3::Y];
-    let exact = renderer
-        .surfaces(&pose, &directions, f32::INFINITY)
-        .unwrap();
+    let beams = beams_along(&directions);
+    let exact = renderer.surfaces(&pose, &beams, f32::INFINITY).unwrap();
     let rough = WithoutTriangles(renderer)
-        .surfaces(&pose, &directions, f32::INFINITY)
+        .surfaces(&pose, &beams, f32::INFINITY)
         .unwrap();
     assert_eq!(exact.iter().flatten().count(), 2);
     for (exact, rough) in exact.iter().zip(&rough) {
