@@ -1,8 +1,8 @@
 //! Choice of the times of the points by the residuals of the odometry.
 //!
 //! Points that were measured while the sensor moved agree with the scans before only if they are compensated with
-//! their true times. The odometry runs once with each candidate; its residual has the least value for the right
-//! one. Near the right times it grows with the square of the error: the residual of compensated scans,
+//! their true times. The odometry runs once without times and once with each candidate, from the motions that the first run
+//! found; its residual has the least value for the right one. Near the right times it grows with the square of the error: the residual of compensated scans,
 //! candidates none (0), clockwise (1) and counter-clockwise (−1), is that of 0 by the same amount below both
 //! others, that of clockwise scans by one quarter of the whole range below the next. The scan of a sensor at rest has
 //! the same residual with all candidates. Scans in the order in which their points were measured, which start at
@@ -14,6 +14,7 @@ use rayon::prelude::*;
 
 use super::config::OdometryConfig;
 use super::odometer::{Odometer, OdometryError};
+use crate::geometry::Pose3;
 use crate::lidar::{FiringOrder, PointTiming, Rotation, RotationDirection, Scan};
 use crate::statistics::median;
 use crate::validation::{InvalidValue, Validate as _};
@@ -50,8 +51,10 @@ pub fn compare_timings(
     config: &OdometryConfig,
 ) -> Result<TimingComparison, TimingError> {
     let runs = Runs::new(scans, config)?;
+    let none = (None, runs.none_m);
     if let Some(period_s) = period_of_order(scans, period_s) {
-        return runs.compared(vec![None, Some(PointTiming::Order { period_s })]);
+        let order = PointTiming::Order { period_s };
+        return Ok(TimingComparison::decided(vec![none, runs.with(order)?]));
     }
     let order = scans.first().and_then(FiringOrder::of);
     let first = |direction| Rotation {
@@ -64,21 +67,12 @@ pub fn compare_timings(
         RotationDirection::Clockwise,
         RotationDirection::CounterClockwise,
     ];
-    let (none_m, coarse) = rayon::join(
-        || runs.mean_residual(None),
-        || {
-            let rotations = directions.par_iter().map(|direction| {
-                let first = first(*direction);
-                Ok((first, runs.best_quarter(first)?))
-            });
-            rotations.collect::<Result<Vec<_>, TimingError>>()
-        },
-    );
-    let none_m = none_m?;
-    let fitted = |&(first, coarse): &(Rotation, Fitted)| {
+    let fitted = |direction: &RotationDirection| {
+        let first = first(*direction);
+        let coarse = runs.best_quarter(first)?;
         // The first start fits: there is nothing to refine. Nor where the best of four is clearly worse than no times: a start
         // that is off by an eighth of a turn has wrong times for an eighth of the points.
-        let is_done = coarse.0 == first || coarse.1 > (1.0 + SPREAD) * none_m;
+        let is_done = coarse.0 == first || coarse.1 > (1.0 + SPREAD) * runs.none_m;
         let (rotation, residual_m) = if is_done {
             coarse
         } else {
@@ -86,9 +80,9 @@ pub fn compare_timings(
         };
         Ok((Some(PointTiming::Rotation(rotation)), residual_m))
     };
-    let rotations: Result<Vec<_>, TimingError> = coarse?.par_iter().map(fitted).collect();
-    let residuals_m = [(None, none_m)].into_iter().chain(rotations?).collect();
-    Ok(TimingComparison::decided(residuals_m))
+    let rotations: Result<Vec<_>, TimingError> = directions.par_iter().map(fitted).collect();
+    let residuals_m = [none].into_iter().chain(rotations?);
+    Ok(TimingComparison::decided(residuals_m.collect()))
 }
 
 /// Whether a configured timing has clearly the smallest residual, so that the full comparison is not needed: smaller than no
@@ -105,9 +99,10 @@ pub fn fits_best(
             rotations.map(PointTiming::Rotation).collect()
         }
     };
-    let candidates = timings.into_iter().map(Some).chain([None]);
-    let compared = Runs::new(scans, config)?.compared(candidates.collect())?;
-    Ok(compared.best == Some(0))
+    let runs = Runs::new(scans, config)?;
+    let timed: Result<Vec<_>, TimingError> = timings.par_iter().map(|it| runs.with(*it)).collect();
+    let residuals_m = timed?.into_iter().chain([(None, runs.none_m)]);
+    Ok(TimingComparison::decided(residuals_m.collect()).best == Some(0))
 }
 
 /// A rotation, and the others that start quarters of a turn from it.
@@ -154,10 +149,16 @@ fn period_of_order(scans: &[Scan], interval_s: f64) -> Option<f64> {
     Some(interval_s * TAU / if is_even { usual_rad } else { TAU })
 }
 
-/// Runs of the odometry over the same scans.
+/// Runs of the odometry over the same scans, which begin with one without times.
 struct Runs<'a> {
     scans: &'a [Scan],
     config: OdometryConfig,
+    /// Large scans are thinned, by odd steps, which pass through all beams; without times.
+    thinned: Vec<(usize, Scan)>,
+    /// Mean residual without times; infinite if no scan was registered [m].
+    none_m: f64,
+    /// Motion to each scan without times, where it was found: that of all candidates but for what their times change.
+    motions: Vec<Option<Pose3>>,
 }
 
 /// A rotation and its mean residual [m].
@@ -165,23 +166,36 @@ type Fitted = (Rotation, f64);
 
 impl<'a> Runs<'a> {
     fn new(scans: &'a [Scan], config: &OdometryConfig) -> Result<Self, TimingError> {
+        /// Least number of points of a thinned scan.
+        const POINTS: usize = 30_000;
         config.validate()?;
         // With wrong times no pose fits as it should; the residuals are compared.
         let config = OdometryConfig {
             min_common_share: 0.0,
             ..config.clone()
         };
-        Ok(Self { scans, config })
+        let thinned = |scan: &Scan| {
+            let step = (scan.len() / POINTS).saturating_sub(1) / 2 * 2 + 1;
+            let mut thinned = scan.every(step);
+            thinned.times_s.clear();
+            (step, thinned)
+        };
+        let mut runs = Self {
+            scans,
+            config: config.clone(),
+            thinned: scans.iter().map(thinned).collect(),
+            none_m: f64::INFINITY,
+            motions: vec![None; scans.len()],
+        };
+        (runs.none_m, runs.motions) = runs.run(None)?;
+        // From these motions on, half of the iterations are enough.
+        runs.config.iterations = config.iterations.div_ceil(2);
+        Ok(runs)
     }
 
-    fn compared(
-        &self,
-        candidates: Vec<Option<PointTiming>>,
-    ) -> Result<TimingComparison, TimingError> {
-        let residual = |candidate: &Option<PointTiming>| self.mean_residual(*candidate);
-        let residuals: Result<Vec<f64>, _> = candidates.par_iter().map(residual).collect();
-        let residuals_m = candidates.into_iter().zip(residuals?).collect();
-        Ok(TimingComparison::decided(residuals_m))
+    /// Some times of points, and their mean residual [m].
+    fn with(&self, timing: PointTiming) -> Result<(Option<PointTiming>, f64), TimingError> {
+        Ok((Some(timing), self.run(Some(timing))?.0))
     }
 
     /// The start of the revolution with the least residual among a first one and those by quarters of a turn from it. Points
@@ -213,25 +227,41 @@ impl<'a> Runs<'a> {
     }
 
     fn residuals_of(&self, rotations: &[Rotation]) -> Result<Vec<f64>, TimingError> {
-        let residual = |&it: &Rotation| self.mean_residual(Some(PointTiming::Rotation(it)));
+        let residual = |&it: &Rotation| Ok(self.with(PointTiming::Rotation(it))?.1);
         rotations.par_iter().map(residual).collect()
     }
 
-    /// Mean residual of the registered scans; infinite if there are none [m]. Large scans are thinned to every third point, fifth
-    /// and so on: odd steps pass through all beams.
-    fn mean_residual(&self, candidate: Option<PointTiming>) -> Result<f64, TimingError> {
-        /// Least number of points that are left.
-        const POINTS: usize = 30_000;
+    /// Mean residual of the registered scans, infinite if there are none [m], and the motions to these.
+    fn run(
+        &self,
+        candidate: Option<PointTiming>,
+    ) -> Result<(f64, Vec<Option<Pose3>>), TimingError> {
         let mut odometer = Odometer::new(self.config.clone())?;
         let (mut sum_m, mut count) = (0.0, 0);
-        for scan in self.scans {
-            let step = (scan.len() / POINTS).saturating_sub(1) / 2 * 2 + 1;
-            let times_s = candidate.map_or_else(Vec::new, |timing| timing.point_times(scan));
-            let thinned = Scan {
-                times_s: times_s.into_iter().step_by(step).collect(),
-                ..scan.every(step)
+        let mut motions = Vec::with_capacity(self.scans.len());
+        for ((scan, (step, thinned)), motion) in
+            self.scans.iter().zip(&self.thinned).zip(&self.motions)
+        {
+            let mut thinned = thinned.clone();
+            thinned.times_s = match candidate {
+                None => vec![],
+                // Of the azimuths of the points alone, not of their order.
+                Some(PointTiming::Rotation(rotation)) => rotation.point_times(&thinned.points),
+                Some(order) => (order.point_times(scan).into_iter())
+                    .step_by(*step)
+                    .collect(),
             };
-            if let Some(residual_m) = odometer.step(&thinned)?.residual_m {
+            if let Some(motion) = motion {
+                odometer.set_motion(&thinned, *motion);
+            }
+            let found = odometer.step(&thinned)?;
+            motions.push(
+                found
+                    .state
+                    .is_measured()
+                    .then_some(found.previous_from_current),
+            );
+            if let Some(residual_m) = found.residual_m {
                 sum_m += residual_m;
                 count += 1;
             }
@@ -241,7 +271,7 @@ impl<'a> Runs<'a> {
             _ => sum_m / f64::from(count),
         };
         tracing::debug!("{candidate:?}: mean residual {:.2} mm", 1e3 * mean_m);
-        Ok(mean_m)
+        Ok((mean_m, motions))
     }
 }
 
