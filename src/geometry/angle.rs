@@ -14,7 +14,7 @@ pub fn wrap_angle(angle_rad: f64) -> f64 {
 
 /// Index of the sector of azimuth that contains a direction; `count` sectors begin at −π.
 pub fn azimuth_sector(direction: Vec3, count: usize) -> usize {
-    let turns = 0.5 + direction.y.atan2(direction.x) / std::f32::consts::TAU;
+    let turns = 0.5 + fast_atan2(direction.y, direction.x) / f32::consts::TAU;
     ((turns * count as f32) as usize).min(count - 1)
 }
 

@@ -21,12 +21,13 @@ use std::f32::consts::TAU;
 use std::f64::consts::PI;
 
 use glam::Vec3;
-use nalgebra::UnitQuaternion;
+use nalgebra::{UnitQuaternion, Vector3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::scan::Scan;
 use crate::geometry::pose::{exponential, logarithm};
-use crate::geometry::{Pose3, Rigid3f, wrap_angle};
+use crate::geometry::{Pose3, Rigid3f, fast_atan2, wrap_angle};
 use crate::inertial::MeasuredRotation;
 
 /// Duration of a revolution, and time between scans, where nothing shows it [s].
@@ -87,8 +88,16 @@ impl Rotation {
         let sense = self.direction.sense() as f32;
         let (middle_rad, period_s) = (wrap_angle(self.start_rad + PI) as f32, self.period_s as f32);
         let time = |point: &Vec3| {
-            let turns = sense * (point.y.atan2(point.x) - middle_rad) / TAU;
-            (turns - (turns + 0.5).floor()) * period_s
+            let turns = sense * (fast_atan2(point.y, point.x) - middle_rad) / TAU;
+            // Of -1 to 1 turns; a call of `floor` would take as long as the rest.
+            let whole = if turns >= 0.5 {
+                1.0
+            } else if turns < -0.5 {
+                -1.0
+            } else {
+                0.0
+            };
+            (turns - whole) * period_s
         };
         points.iter().map(time).collect()
     }
@@ -150,9 +159,10 @@ impl Motion {
         let sweep = Sweep::spanning(scan.times_s.iter().copied());
         let turns = sweep.turns(scan.measured_rotation().as_ref());
         let transforms = sweep.transforms(self, turns.as_deref());
-        for (point, &time_s) in scan.points.iter_mut().zip(&scan.times_s) {
+        let points = scan.points.par_iter_mut().zip(&scan.times_s);
+        points.for_each(|(point, &time_s)| {
             *point = transforms[sweep.interval(time_s)].apply(*point);
-        }
+        });
         scan.times_s.clear();
     }
 }
@@ -161,12 +171,13 @@ impl Motion {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sweep {
     first_s: f32,
-    last_s: f32,
     interval_s: f32,
+    /// Number of intervals.
+    intervals: usize,
 }
 
 impl Sweep {
-    const INTERVALS: usize = 720;
+    const MAX_INTERVALS: usize = 720;
 
     /// The intervals between the first and the last of finite times.
     pub fn spanning(times_s: impl Iterator<Item = f32>) -> Self {
@@ -180,19 +191,21 @@ impl Sweep {
             (0.0, 0.0)
         };
         // Powers of two and their multiples, so that the intervals do not depend on rounding of the first and last time.
-        let least_s = ((last_s - first_s) / (Self::INTERVALS - 1) as f32).max(1e-9);
+        let least_s = ((last_s - first_s) / (Self::MAX_INTERVALS - 1) as f32).max(1e-9);
         let interval_s = least_s.log2().ceil().exp2();
-        Self {
+        let mut sweep = Self {
             first_s: (first_s / interval_s).floor() * interval_s,
-            last_s,
             interval_s,
-        }
+            intervals: Self::MAX_INTERVALS,
+        };
+        sweep.intervals = sweep.interval(last_s) + 1;
+        sweep
     }
 
     /// Number of the interval of a time.
     #[inline]
     pub fn interval(&self, time_s: f32) -> usize {
-        (((time_s - self.first_s) / self.interval_s) as usize).min(Self::INTERVALS - 1)
+        (((time_s - self.first_s) / self.interval_s) as usize).min(self.intervals - 1)
     }
 
     /// For each interval, the transform of points to the moment of the scan's pose, with measured rotations where there are
@@ -202,22 +215,22 @@ impl Sweep {
         motion: &Motion,
         turns: Option<&[UnitQuaternion<f64>]>,
     ) -> Vec<Rigid3f> {
+        let arc = CircularArc::new(&motion.previous_from_current);
         let transform = |interval: usize| {
-            let mut moved = motion.after(self.middle_s(interval).into());
+            let time_s = f64::from(self.middle_s(interval));
+            let mut moved = arc.at(time_s / motion.duration_s);
             if let Some(turns) = turns {
                 moved.rotation = turns[interval];
             }
             Rigid3f::from(&moved)
         };
-        (0..Self::INTERVALS).map(transform).collect()
+        (0..self.intervals).map(transform).collect()
     }
 
     /// For each interval, the measured rotation of points to the moment of the scan's pose; `None` where it was not measured.
     pub fn turns(&self, rotation: Option<&MeasuredRotation>) -> Option<Vec<UnitQuaternion<f64>>> {
-        // Nothing is measured after the sweep of a last scan, and nothing is needed there.
-        let used = self.interval(self.last_s);
-        let middle_s = |interval: usize| self.middle_s(interval.min(used)).into();
-        let times_s: Vec<f64> = (0..Self::INTERVALS).map(middle_s).collect();
+        let middle_s = |interval: usize| self.middle_s(interval).into();
+        let times_s: Vec<f64> = (0..self.intervals).map(middle_s).collect();
         rotation?.around(&times_s)
     }
 
@@ -230,11 +243,31 @@ impl Sweep {
 /// A fraction of a motion at constant velocity: identity for 0, the motion for 1, backward if
 /// negative.
 pub fn interpolate_motion(motion: &Pose3, fraction: f64) -> Pose3 {
-    let axis_angle = motion.rotation.scaled_axis();
-    let rotation = |fraction| nalgebra::UnitQuaternion::from_scaled_axis(axis_angle * fraction);
-    // The chord, rotated back by half of the remaining rotation: the arc to second order.
-    let translation = rotation(0.5 * (fraction - 1.0)) * motion.translation.vector * fraction;
-    Pose3::from_parts(translation.into(), rotation(fraction))
+    CircularArc::new(motion).at(fraction)
+}
+
+/// A motion at constant velocity.
+struct CircularArc {
+    /// [rad]
+    axis_angle: Vector3<f64>,
+    chord_m: Vector3<f64>,
+}
+
+impl CircularArc {
+    fn new(motion: &Pose3) -> Self {
+        Self {
+            axis_angle: motion.rotation.scaled_axis(),
+            chord_m: motion.translation.vector,
+        }
+    }
+
+    /// A fraction of the motion.
+    fn at(&self, fraction: f64) -> Pose3 {
+        let rotation = |fraction| UnitQuaternion::from_scaled_axis(self.axis_angle * fraction);
+        // The chord, rotated back by half of the remaining rotation: the arc to second order.
+        let translation = rotation(0.5 * (fraction - 1.0)) * self.chord_m * fraction;
+        Pose3::from_parts(translation.into(), rotation(fraction))
+    }
 }
 
 #[cfg(test)]

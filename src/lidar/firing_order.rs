@@ -20,7 +20,7 @@ use std::ops::RangeInclusive;
 
 use super::deskewing::{Rotation, RotationDirection};
 use super::scan::Scan;
-use crate::geometry::wrap_angle;
+use crate::geometry::{fast_atan2, wrap_angle};
 
 /// Source of the times of points that have none.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -130,7 +130,7 @@ fn azimuths(scan: &Scan) -> Vec<(usize, f64)> {
     let points = scan.points.iter().enumerate();
     points
         .filter(|(_, point)| point.is_finite() && point.length() > NEAREST_M)
-        .map(|(number, point)| (number, f64::from(point.y.atan2(point.x))))
+        .map(|(number, point)| (number, f64::from(fast_atan2(point.y, point.x))))
         .collect()
 }
 

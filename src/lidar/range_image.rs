@@ -1,6 +1,7 @@
 //! Range images: per pixel the range of the nearest return and its measured beam.
 
 use glam::Vec3;
+use rayon::prelude::*;
 
 use super::model::LidarModel;
 use super::projection::Projection;
@@ -11,6 +12,9 @@ pub const NO_RETURN: f32 = f32::INFINITY;
 
 /// Point index of a pixel without a point.
 const NO_POINT: u32 = u32::MAX;
+
+/// Pixel of a point out of the image.
+const NO_PIXEL: u32 = u32::MAX;
 
 /// Range and point per pixel, row-major.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,16 +39,16 @@ impl RangeImage {
             point_indices: vec![NO_POINT; model.len()],
         };
         let projection = Projection::of(model);
-        for (point_index, &point) in points.iter().enumerate() {
-            let range_m = point.length();
-            if !model.accepts_range(range_m) {
-                continue;
-            }
-            let Some(index) = projection.pixel_of(point) else {
-                continue;
-            };
-            if range_m < image.ranges[index] {
-                image.ranges[index] = range_m;
+        let pixel = |point: &Vec3| {
+            let is_valid = model.accepts_range(point.length());
+            let pixel = is_valid.then(|| projection.pixel_of(*point)).flatten();
+            pixel.map_or(NO_PIXEL, |pixel| pixel as u32)
+        };
+        let pixels: Vec<u32> = points.par_iter().map(pixel).collect();
+        for (point_index, (&point, pixel)) in points.iter().zip(pixels).enumerate() {
+            let index = pixel as usize;
+            if pixel != NO_PIXEL && point.length() < image.ranges[index] {
+                image.ranges[index] = point.length();
                 image.points[index] = point;
                 image.point_indices[index] = point_index as u32;
             }
