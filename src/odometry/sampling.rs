@@ -5,7 +5,7 @@ use glam::{DMat3, DQuat, DVec3, Vec3};
 use nalgebra::UnitQuaternion;
 
 use super::config::OdometryConfig;
-use super::voxel_map::pack;
+use super::voxel_map::{cell_of, pack};
 use crate::geometry::Pose3;
 use crate::inertial::MeasuredRotation;
 use crate::lidar::{Motion, Scan, Sweep};
@@ -103,7 +103,7 @@ pub fn first_per_voxel(points: impl Iterator<Item = TimedPoint>, voxel_m: f64) -
     let per_m = (1.0 / voxel_m) as f32;
     let mut occupied = HashSet::<u64>::default();
     points
-        .filter(|point| occupied.insert(pack((point.position * per_m).floor().as_ivec3())))
+        .filter(|point| occupied.insert(pack(cell_of((point.position * per_m).as_dvec3()))))
         .collect()
 }
 

@@ -10,8 +10,17 @@
 
 use foldhash::HashMap;
 use glam::{DMat3, DVec3, IVec3, Vec3};
+use rayon::prelude::*;
 
 use crate::geometry::PlaneSums;
+
+/// The cell of an edge of one that contains a point; without the calls of `f64::floor`, which is a function where the
+/// instruction set has no rounding.
+pub fn cell_of(point: DVec3) -> IVec3 {
+    let toward_zero = point.as_ivec3();
+    let above = toward_zero.as_dvec3().cmpgt(point);
+    IVec3::select(above, toward_zero.wrapping_sub(IVec3::ONE), toward_zero)
+}
 
 /// Voxel coordinates as one number; they wrap after two million voxels.
 pub fn pack(cell: IVec3) -> u64 {
@@ -107,14 +116,15 @@ impl VoxelMap {
 
     /// Adds points.
     pub fn insert(&mut self, points: &[DVec3]) {
-        for level in &mut self.levels {
+        let point_limit = self.point_limit;
+        self.levels.par_iter_mut().for_each(|level| {
             for &point in points {
-                let cell = (point / level.edge_m).floor();
-                let offset = (point - cell * level.edge_m).as_vec3();
-                let moments = level.cells.entry(pack(cell.as_ivec3())).or_default();
-                moments.add(offset, self.point_limit);
+                let cell = cell_of(point / level.edge_m);
+                let offset = (point - cell.as_dvec3() * level.edge_m).as_vec3();
+                let moments = level.cells.entry(pack(cell)).or_default();
+                moments.add(offset, point_limit);
             }
-        }
+        });
     }
 
     /// The means of the finest voxels, in a fixed order.
@@ -131,13 +141,13 @@ impl VoxelMap {
 
     /// Removes voxels whose mean is farther than `radius_m` from a point.
     pub fn remove_beyond(&mut self, center: DVec3, radius_m: f64) {
-        for level in &mut self.levels {
+        self.levels.par_iter_mut().for_each(|level| {
             let edge_m = level.edge_m;
             level.cells.retain(|&key, _| {
                 let corner = unpack(key).as_dvec3() * edge_m;
                 corner.distance_squared(center) <= radius_m * radius_m
             });
-        }
+        });
     }
 
     /// The block of finest voxels around a point: two points in one block have the same surface.
@@ -169,7 +179,7 @@ fn unpack(key: u64) -> IVec3 {
 
 impl VoxelGrid {
     fn block(&self, point: DVec3) -> IVec3 {
-        (point / self.edge_m - 0.5).floor().as_ivec3()
+        cell_of(point / self.edge_m - 0.5)
     }
 
     fn surface(&self, point: DVec3) -> Option<Surface> {
@@ -222,6 +232,15 @@ impl VoxelGrid {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn cells_are_those_of_the_floor_of_coordinates() {
+        for value in [-2.0, -1.5, -1e-9, -0.0, 0.0, 0.3, 1.0, 1.999, 7e5 + 0.5] {
+            let cell = cell_of(DVec3::new(value, -value, 2.0 * value));
+            let expected = DVec3::new(value, -value, 2.0 * value).floor();
+            assert_eq!(cell.as_dvec3(), expected);
+        }
+    }
 
     #[test]
     fn unpacking_inverts_packing() {
