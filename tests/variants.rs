@@ -1,8 +1,7 @@
 //! Campaign of variants: recordings and maps that differ from what is usual, in one way each.
 //!
 //! Every call ends with a result or an error of one line, within the memory that it is given, and no frame that is
-//! called tracking is off by more than half a metre, but for those of [`KNOWN`]. A third is tried, with `FPMCL_VARIANTS`
-//! set all; `--nocapture` prints the table of `docs/reliability.md`.
+//! called tracking is off by more than half a metre. A third is tried, with `FPMCL_VARIANTS` set all; `--nocapture` prints the table of `docs/reliability.md`.
 
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
@@ -34,9 +33,6 @@ const WRONG_M: f64 = 0.5;
 
 /// Memory that a call may have [KiB], 3 GiB.
 const MEMORY_KIB: usize = 3 << 20;
-
-/// Variants of which frames may still be wrong and called tracking.
-const KNOWN: [(&str, usize); 1] = [("every scan twice", 1)];
 
 /// Scans of the longest recording, a drive to and fro; more in the campaign.
 const LONG: [usize; 2] = [400, 1200];
@@ -535,14 +531,7 @@ fn no_variant_is_wrong_and_sure_or_ends_in_anything_but_an_error() {
     for row in &rows {
         println!("| {} | {} | {} |", row.class, row.variant, row.outcome);
     }
-    let is_bad = |row: &&Row| match row.outcome {
-        Outcome::Failed => true,
-        Outcome::Wrong(frames) => {
-            let known = KNOWN.iter().find(|(variant, _)| *variant == row.variant);
-            known.is_none_or(|(_, most)| frames > *most)
-        }
-        _ => false,
-    };
+    let is_bad = |row: &&Row| matches!(row.outcome, Outcome::Failed | Outcome::Wrong(_));
     let bad: Vec<String> = (rows.iter().filter(is_bad))
         .map(|row| {
             let Row {
