@@ -1,8 +1,7 @@
 //! Choice of the times of the points by the residuals of the odometry.
 //!
 //! Points that were measured while the sensor moved agree with the scans before only if they are compensated with
-//! their true times. The odometry runs once without times and once with each candidate, from the motions that the first run
-//! found; its residual has the least value for the right one. Near the right times it grows with the square of the error: the residual of compensated scans,
+//! their true times. The odometry runs once without times and once with each candidate; its residual has the least value for the right one. Near the right times it grows with the square of the error: the residual of compensated scans,
 //! candidates none (0), clockwise (1) and counter-clockwise (−1), is that of 0 by the same amount below both
 //! others, that of clockwise scans by one quarter of the whole range below the next. The scan of a sensor at rest has
 //! the same residual with all candidates. Scans in the order in which their points were measured, which start at
@@ -157,7 +156,7 @@ struct Runs<'a> {
     thinned: Vec<(usize, Scan)>,
     /// Mean residual without times; infinite if no scan was registered [m].
     none_m: f64,
-    /// Motion to each scan without times, where it was found: that of all candidates but for what their times change.
+    /// Motion to each scan without times, where it was found.
     motions: Vec<Option<Pose3>>,
 }
 
@@ -182,14 +181,12 @@ impl<'a> Runs<'a> {
         };
         let mut runs = Self {
             scans,
-            config: config.clone(),
+            config,
             thinned: scans.iter().map(thinned).collect(),
             none_m: f64::INFINITY,
             motions: vec![None; scans.len()],
         };
         (runs.none_m, runs.motions) = runs.run(None)?;
-        // From these motions on, half of the iterations are enough.
-        runs.config.iterations = config.iterations.div_ceil(2);
         Ok(runs)
     }
 
@@ -236,7 +233,14 @@ impl<'a> Runs<'a> {
         &self,
         candidate: Option<PointTiming>,
     ) -> Result<(f64, Vec<Option<Pose3>>), TimingError> {
-        let mut odometer = Odometer::new(self.config.clone())?;
+        // Scans that all start at one azimuth have the motions that were found without times; half of the iterations are
+        // enough from them on. By the order of the points each scan has its own start, which moves it.
+        let has_motions = matches!(candidate, Some(PointTiming::Rotation(_)));
+        let mut config = self.config.clone();
+        if has_motions {
+            config.iterations = config.iterations.div_ceil(2);
+        }
+        let mut odometer = Odometer::new(config)?;
         let (mut sum_m, mut count) = (0.0, 0);
         let mut motions = Vec::with_capacity(self.scans.len());
         for ((scan, (step, thinned)), motion) in
@@ -251,8 +255,8 @@ impl<'a> Runs<'a> {
                     .step_by(*step)
                     .collect(),
             };
-            if let Some(motion) = motion {
-                odometer.set_motion(&thinned, *motion);
+            if let Some(motion) = motion.filter(|_| has_motions) {
+                odometer.set_motion(&thinned, motion);
             }
             let found = odometer.step(&thinned)?;
             motions.push(
