@@ -10,6 +10,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use common::fpmcl;
 use fpmcl::geometry::Pose3;
 use fpmcl::memory::MemoryBudget;
 use fpmcl::recording::{Recording, RecordingError, Selection};
@@ -788,6 +789,18 @@ fn assert_same_poses(name: &str, found: &[Pose3], expected: &[Pose3], tolerance:
             difference.abs().max() < tolerance,
             "{name}: {found} {expected}"
         );
+    }
+}
+
+#[test]
+fn measurements_are_given_by_the_folder_of_kitti() {
+    let set = kitti_raw();
+    for flag in ["--imu", "--gnss"] {
+        // It is read up to what it lacks.
+        let odometry = fpmcl("odometry").in_folder(set.folder.path());
+        let odometry = odometry.with(set.path).with("--output=found");
+        let oxts = format!("{flag}={}/oxts", set.path);
+        odometry.with(oxts).fails_with(&["oxts/timestamps.txt"]);
     }
 }
 

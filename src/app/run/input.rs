@@ -6,14 +6,15 @@ use anyhow::{Result, ensure};
 
 use crate::app::settings::MapInputConfig;
 
-/// Requires the inputs of a command, each with its configuration key: files, the folder or bag of a recording, and poses,
-/// which may be a folder `oxts`.
+/// Requires the inputs of a command, each with its configuration key: files, the folder or bag of a recording, and poses or
+/// measurements, which may be a folder `oxts`.
 pub fn require(inputs: &[(&str, &Path)]) -> Result<()> {
     for &(key, path) in inputs {
         match key {
             "scan_folder" if !is_bag(path) => require_folder(key, path)?,
             // A folder of a bag, and a folder `oxts`.
-            "scan_folder" | "pose_file" | "odometry_file" if path.is_dir() => {}
+            "scan_folder" | "pose_file" | "odometry_file" | "imu_file" | "gnss_file"
+                if path.is_dir() => {}
             _ => require_file(key, path)?,
         }
     }
@@ -39,6 +40,8 @@ fn with_flag(key: &str) -> String {
         "pose_file" => "--poses, --truth",
         "calib_file" => "--calib",
         "odometry_file" => "--odometry",
+        "imu_file" => "--imu",
+        "gnss_file" => "--gnss",
         "onto" => "--onto",
         _ => return key.to_owned(),
     };

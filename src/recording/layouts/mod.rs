@@ -67,9 +67,10 @@ pub fn find(
             if layout == Some(files.layout) {
                 return Ok(files);
             }
-            Err(refused(
-                "velodyne/, or velodyne_points/data/ of the raw data",
-            ))
+            Err(refused(match layout {
+                Some(Layout::KittiRaw) => "velodyne_points/data/",
+                _ => "velodyne/",
+            }))
         }
         Some(Layout::Bag) => Err(refused("an .mcap, .bag or .db3 file, or metadata.yaml")),
         Some(_) => Err(refused("scans in memory")),
