@@ -19,7 +19,13 @@ pub fn read_rows(path: &Path) -> Result<Vec<(usize, Vec<f64>)>, RecordingError> 
 
 /// Reads a whole file as text, without the byte order mark that some editors write.
 pub fn read_text(path: &Path) -> Result<String, RecordingError> {
-    let mut text = memory::read_text(path).map_err(RecordingError::read(path))?;
+    let bytes = memory::read_file(path).map_err(RecordingError::read(path))?;
+    text_of(bytes, path)
+}
+
+/// The bytes of a file as text, likewise.
+pub fn text_of(bytes: Vec<u8>, path: &Path) -> Result<String, RecordingError> {
+    let mut text = memory::text_of(bytes).map_err(RecordingError::read(path))?;
     if text.starts_with('\u{feff}') {
         text.remove(0);
     }

@@ -9,8 +9,9 @@ use std::path::Path;
 use super::error::RecordingError;
 use super::found_fixes::{FoundFixes, is_position};
 use super::oxts;
-use super::table::{parse_numbers, read_text};
+use super::table::{parse_numbers, text_of};
 use crate::georeference::{Geodetic, GeodeticFix, GeodeticFixes};
+use crate::memory;
 
 /// Reads the fixes of a file or of a folder `oxts`.
 ///
@@ -20,12 +21,29 @@ pub fn read(path: &Path) -> Result<GeodeticFixes, RecordingError> {
     if path.is_dir() {
         return oxts::read_fixes(path)?.checked(path);
     }
-    let text = read_text(path)?;
+    let bytes = memory::read_file(path).map_err(RecordingError::read(path))?;
     #[cfg(feature = "bags")]
-    if (text.lines()).any(|line| line.trim_start().starts_with('$')) {
-        return nmea::parse(&text).checked(path);
+    if let Some(sentences) = sentences(&bytes) {
+        return nmea::parse(&sentences).checked(path);
     }
-    table(&text, path)?.checked(path)
+    table(&text_of(bytes, path)?, path)?.checked(path)
+}
+
+/// The lines of a log with sentences of NMEA, each from its dollar sign on: loggers write times before them, and receivers other
+/// messages between them. `None` where no line has a sentence.
+#[cfg(feature = "bags")]
+fn sentences(bytes: &[u8]) -> Option<String> {
+    let text = String::from_utf8_lossy(bytes);
+    let is_sentence = |line: &str| {
+        let talker = line
+            .find('$')
+            .and_then(|start| line.get(start + 1..start + 3));
+        talker.is_some_and(|talker| talker.bytes().all(|letter| letter.is_ascii_alphanumeric()))
+    };
+    text.lines().any(is_sentence).then(|| {
+        let from_dollar = |line| str::find(line, '$').map_or(line, |start| &line[start..]);
+        text.lines().map(from_dollar).collect::<Vec<_>>().join("\n")
+    })
 }
 
 /// Reads rows of time [s], latitude, longitude [deg], height above the ellipsoid [m] and, optionally, the standard deviations
@@ -81,7 +99,7 @@ mod tests {
     use super::*;
     use crate::georeference::HeightReference;
 
-    fn read_of(name: &str, text: &str) -> Result<GeodeticFixes, RecordingError> {
+    fn read_of(name: &str, text: impl AsRef<[u8]>) -> Result<GeodeticFixes, RecordingError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(name);
         fs::write(&path, text).unwrap();
@@ -125,13 +143,15 @@ mod tests {
             $GPRMC,235959.00,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*48\r\n\
             $GPGST,235959.00,1.2,,,,0.8,0.6,2.5*72\r\n\
             garbage\r\n\
-            $GPGGA,000000.00,4807.044,N,01131.000,E,4,08,0.9,545.5,M,46.9,M,,*6B\r\n\
+            1994-03-23T23:59:59Z $GPGGA,000000.00,4807.044,N,01131.000,E,4,08,0.9,545.5,M,46.9,M,,*6B\r\n\
             $GPGGA,000001.00,4807.044,N,01131.000,E,4,08,0.9,545.5,M,46.9,M,,*00\r\n\
             $GPGGA,000002.00,,,,,0,00,,,M,,M,,*4A\r\n";
-        let found = read_of("drive.nmea", text).unwrap();
+        // A message of another protocol in between.
+        let bytes = [text.as_bytes(), b"\xb5\x62\x01\xfe\r\n"].concat();
+        let found = read_of("drive.nmea", bytes).unwrap();
         assert_eq!(
             [found.fixes.len(), found.bad_lines, found.without_position],
-            [2, 2, 1]
+            [2, 3, 1]
         );
         // 1994-03-23, and the midnight after it.
         assert_eq!(found.fixes[0].time_s, 764_467_199.0);
