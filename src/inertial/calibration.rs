@@ -9,7 +9,7 @@
 //! rotations about axes that change do not add up. A mirrored sensor is one that R with a determinant of -1
 //! fits far better.
 //!
-//! Umeyama, *Least-Squares Estimation of Transformation Parameters* (1991), for R; Furgale et al., *Unified Temporal
+//! Umeyama, *Least-Squares Estimation of Transformation Parameters* (1991), for R and the scale, which must be about one; Furgale et al., *Unified Temporal
 //! and Spatial Calibration* (IROS 2013), for the problem.
 
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
@@ -78,6 +78,8 @@ pub enum ImuRejection {
         rate_deg_s: f64,
         hint: String,
     },
+    #[error("its rates are {scale:.2} times those of the scans; correct their unit")]
+    Scaled { scale: f64 },
     #[error(
         "the drive does not show how it is mounted, to {sigma_deg:.0} deg; give its rotation with lidar_from_imu"
     )]
@@ -103,6 +105,7 @@ impl ImuRejection {
             | Self::Offset { .. }
             | Self::Mirrored
             | Self::Unexplained { .. }
+            | Self::Scaled { .. }
             | Self::Forces { .. } => true,
         }
     }
@@ -155,6 +158,7 @@ impl ImuCalibration {
         let (offset_s, fit) = best_offset(samples, &kept, given, &about_rad_s);
         if let Some(given) = given
             && !fit.is_still()
+            && !fit.is_scaled()
             && !fit.is_explained()
         {
             let (_, free) = best_offset(samples, turns, None, &about_rad_s);
@@ -233,6 +237,9 @@ fn rates(
         .collect()
 }
 
+/// Largest share of the squares of rates that may remain.
+const MAX_REMAINING: f64 = 0.4;
+
 /// Axes and bias that fit pairs of rates best.
 struct Fit {
     lidar_from_imu: UnitQuaternion<f64>,
@@ -243,6 +250,10 @@ struct Fit {
     sigma_rad: f64,
     /// Decrease of the squares by a reflection, in variances.
     mirror_gain: f64,
+    /// What the rates of the sensor are in those of the lidar, about any axes, and its standard deviation (unitless).
+    scale: [f64; 2],
+    /// Share of the squares that remains if that is taken into account.
+    remaining_of_scaled: f64,
 }
 
 impl Fit {
@@ -273,6 +284,12 @@ impl Fit {
         // Information of a small rotation: Σ |y|² − y yᵀ. Neighbouring errors are correlated: four count as one.
         let information = (Matrix3::identity() * squares_y - spread) / (4.0 * variance);
         let least = information.symmetric_eigenvalues().min().max(1e-12);
+        // Umeyama's c, by which the rates of the sensor are multiplied.
+        let aligned = (free.transpose() * common).trace().max(0.0);
+        let factor = (aligned / squares_y.max(1e-18)).max(1e-6);
+        let squares_of_scaled = (squares_x - factor * aligned).max(0.0);
+        let remaining_of_scaled = squares_of_scaled / squares_x.max(1e-18);
+        let sigma = (4.0 * squares_of_scaled / (3.0 * count * squares_y.max(1e-18))).sqrt();
         Self {
             lidar_from_imu,
             bias_rad_s: mean_y - lidar_from_imu.inverse() * mean_x,
@@ -280,6 +297,8 @@ impl Fit {
             signals_rad_s: [squares_x, squares_y].map(root),
             sigma_rad: least.sqrt().recip(),
             mirror_gain: (remaining(&free) - remaining(&mirrored)) / variance,
+            scale: [factor.recip(), sigma / factor.powi(2)],
+            remaining_of_scaled,
         }
     }
 
@@ -297,9 +316,17 @@ impl Fit {
 
     /// Whether the rates of the sensor are those of the lidar.
     fn is_explained(&self) -> bool {
-        /// Largest share of the squares that may remain.
-        const MAX_REMAINING: f64 = 0.4;
         self.residual_rad_s.powi(2) <= MAX_REMAINING * self.signals_rad_s[0].powi(2)
+    }
+
+    /// Whether they are those of the lidar but for their scale.
+    fn is_scaled(&self) -> bool {
+        /// Largest error of the scale: three times that of an MPU-6050 by its data sheet, 3 % (unitless).
+        const MAX_ERROR: f64 = 0.1;
+        const SIGMAS: f64 = 3.0;
+        let [scale, sigma] = self.scale;
+        self.remaining_of_scaled <= MAX_REMAINING
+            && (scale - 1.0).abs() > MAX_ERROR + SIGMAS * sigma
     }
 
     /// The rejection of a sensor whose rates are others, unless its axes are turned.
@@ -324,6 +351,10 @@ impl Fit {
         }
         if self.mirror_gain > MIRRORED {
             return Err(ImuRejection::Mirrored);
+        }
+        if self.is_scaled() {
+            let [scale, _] = self.scale;
+            return Err(ImuRejection::Scaled { scale });
         }
         if !self.is_explained() {
             return Err(self.unexplained(None));

@@ -179,6 +179,18 @@ fn a_wrong_sensor_is_refused_with_its_reason() {
     }
     let refused = estimate(mirrored, &noisy(hand), None).unwrap_err();
     assert_eq!(refused, ImuRejection::Mirrored);
+    // Another scale, with its axes given and not.
+    for (scale, given) in [(1.5, None), (0.45, Some(mounting())), (57.3, None)] {
+        let mut scaled = imu(car, 0.0);
+        for sample in &mut scaled {
+            sample.rate_rad_s *= scale;
+        }
+        let refused = estimate(scaled, &noisy(car), given).unwrap_err();
+        let ImuRejection::Scaled { scale: found } = refused else {
+            panic!("{refused}");
+        };
+        assert_relative_eq!(found, scale, max_relative = 0.02);
+    }
     // A range of 0.2 rad/s.
     let mut clipped = imu(car, 0.0);
     for sample in &mut clipped {
