@@ -124,7 +124,7 @@ pub enum RecordingError {
     NoImuCalibration { path: PathBuf },
     #[error("{} {problem}", path.display())]
     BadImu { path: PathBuf, problem: ImuError },
-    #[error("{}: the header `{header}` does not name one time, three angular rates (gyro_x ...) and three forces (acc_x ...)", path.display())]
+    #[error("{}: the first row `{header}` is no header that names one time, three angular rates (gyro_x ...) and three forces (acc_x ...), nor has it seven numbers in this order", path.display())]
     ImuColumns { path: PathBuf, header: String },
     #[error("{}: the unit of the {quantity} is unknown: {value:.3e} {of}; state it in a header such as time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,acc_x_m_s2,acc_y_m_s2,acc_z_m_s2", path.display())]
     ImuUnit {

@@ -178,7 +178,9 @@ fn read_table(path: &Path) -> Result<Vec<ImuSample>, RecordingError> {
                 }
                 continue;
             }
-            None => columns.insert(Columns::in_order()),
+            // Other columns may be anything: a magnetometer's, or an orientation.
+            None if words(row).count() <= 7 => columns.insert(Columns::in_order()),
+            None => return Err(bad_columns(path, row)),
         };
         let numbers = parse_numbers(&row.replace([',', ';'], " "), path, line)?;
         let at = |[x, y, z]: [usize; 3]| {
@@ -230,6 +232,14 @@ fn words(row: &str) -> impl Iterator<Item = &str> {
         .filter(|word| !word.is_empty())
 }
 
+/// The axis that a name of a column ends with, before its unit: x, y or z, as in `wx`, `gyro_x [rad/s]` or `angular_velocity.x`.
+fn axis_of(name: &str) -> Option<char> {
+    let name = name.split(['[', '(']).next().unwrap_or_default().trim();
+    let is_axis = |part: &&str| part.len() <= 5 && part.ends_with(['x', 'y', 'z']);
+    let mut parts = name.split(['_', '.', ' ', '/', '-']).rev();
+    parts.find(is_axis)?.chars().last()
+}
+
 fn bad_columns(path: &Path, header: &str) -> RecordingError {
     RecordingError::ImuColumns {
         path: path.to_owned(),
@@ -270,13 +280,25 @@ impl Columns {
             found.map(|(column, _)| column).collect()
         };
         let has = |name: &str, parts: &[&str]| parts.iter().any(|part| name.contains(part));
-        let is_rate =
-            |name: &str| has(name, &["gyr", "omega", "rate", "angular"]) || name.starts_with('w');
+        let is_rate = |name: &str| {
+            has(name, &["gyr", "omega", "rate", "angular", "angvel"])
+                || name.starts_with('w')
+                || matches!(name, "gx" | "gy" | "gz")
+        };
         let is_force =
             |name: &str| !is_rate(name) && (has(name, &["acc", "force"]) || name.starts_with('a'));
-        let times = of(&|name| has(name, &["time", "stamp"]) || name == "t");
-        let rates: [usize; 3] = of(&is_rate).try_into().ok()?;
-        let forces: [usize; 3] = of(&is_force).try_into().ok()?;
+        let times = of(&|name| has(name, &["time", "stamp"]) || matches!(name, "t" | "sec"));
+        // Boreas and others begin with z.
+        let by_axis = |found: Vec<usize>| -> Option<[usize; 3]> {
+            let mut columns: [usize; 3] = found.try_into().ok()?;
+            let axis = |column: &usize| axis_of(&names[*column]);
+            if columns.iter().all(|column| axis(column).is_some()) {
+                columns.sort_by_key(axis);
+            }
+            Some(columns)
+        };
+        let rates = by_axis(of(&is_rate))?;
+        let forces = by_axis(of(&is_force))?;
         let time = *times.first()?;
         // The unit is what follows the name.
         let is_in = |column: usize, units: &[&str]| {

@@ -85,6 +85,33 @@ fn units_are_those_of_the_header_or_are_found() {
 
 #[test]
 fn columns_have_the_order_of_the_header() {
+    // Each triple from z to x, as in Boreas, and drivers' names.
+    for header in [
+        "GPSTime,angvel_z,angvel_y,angvel_x,accelz,accely,accelx",
+        "sec,gz,gy,gx,az,ay,ax",
+        "time_s,gyro_z_rad_s,gyro_y_rad_s,gyro_x_rad_s,acc_z_m_s2,acc_y_m_s2,acc_x_m_s2",
+    ] {
+        let samples = read(&format!(
+            "{header}\n1,3,2,1,9.8,0.5,0.4\n1.01,3,2,1,9.8,0.5,0.4\n"
+        ))
+        .unwrap();
+        assert_eq!(
+            samples[0].rate_rad_s,
+            Vector3::new(1.0, 2.0, 3.0),
+            "{header}"
+        );
+        assert_eq!(
+            samples[0].force_m_s2,
+            Vector3::new(0.4, 0.5, 9.8),
+            "{header}"
+        );
+    }
+    // Columns without names that are more than seven may be anything.
+    assert!(
+        read("1,0,0,0,0,0,9.8,30,-5,40\n")
+            .unwrap_err()
+            .contains("seven numbers")
+    );
     let swapped: String = rows(" ", SI)
         .lines()
         .map(|row| {
@@ -113,7 +140,7 @@ fn what_is_ambiguous_is_refused_with_what_to_write() {
     let message = read(&rows(" ", [1e12, 1.0, 1.0])).unwrap_err();
     assert!(message.contains("the unit of the times"), "{message}");
     let message = read(&format!("time,x,y,z\n{}", rows(",", SI))).unwrap_err();
-    assert!(message.contains("the header `time,x,y,z`"), "{message}");
+    assert!(message.contains("the first row `time,x,y,z`"), "{message}");
     let message = read("0 1 2 3 4 5\n").unwrap_err();
     assert!(
         message.contains("line 1: 6 numbers where 7 are needed"),
