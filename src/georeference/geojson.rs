@@ -25,14 +25,13 @@ pub fn write_geojson(
         .filter(|stretch| stretch.len() > 1)
         .map(|stretch| stretch.iter().map(|pose| pose.time_s).collect())
         .collect();
-    let height_above = georeference.height_above;
     match (lines.as_slice(), times_s.as_slice()) {
         ([line], [times_s]) => {
-            let feature = Feature::new("LineString", line, times_s, height_above);
+            let feature = Feature::new("LineString", line, times_s, georeference);
             serde_json::to_writer(&mut writer, &feature)?;
         }
         _ => {
-            let feature = Feature::new("MultiLineString", &lines, &times_s, height_above);
+            let feature = Feature::new("MultiLineString", &lines, &times_s, georeference);
             serde_json::to_writer(&mut writer, &feature)?;
         }
     }
@@ -40,9 +39,9 @@ pub fn write_geojson(
 }
 
 #[derive(Serialize)]
-struct Feature<C, T> {
+struct Feature<'a, C, T> {
     geometry: Geometry<C>,
-    properties: Properties<T>,
+    properties: Properties<'a, T>,
     r#type: &'static str,
 }
 
@@ -53,20 +52,23 @@ struct Geometry<C> {
 }
 
 #[derive(Serialize)]
-struct Properties<T> {
+struct Properties<'a, T> {
+    /// The place of the map on the Earth, with its zone of UTM.
+    georeference: &'a Georeference,
     height_above: HeightReference,
     times_s: T,
 }
 
-impl<C, T> Feature<C, T> {
-    fn new(kind: &'static str, coordinates: C, times_s: T, height_above: HeightReference) -> Self {
+impl<'a, C, T> Feature<'a, C, T> {
+    fn new(kind: &'static str, coordinates: C, times_s: T, georeference: &'a Georeference) -> Self {
         Self {
             geometry: Geometry {
                 coordinates,
                 r#type: kind,
             },
             properties: Properties {
-                height_above,
+                georeference,
+                height_above: georeference.height_above,
                 times_s,
             },
             r#type: "Feature",

@@ -23,7 +23,7 @@ use crate::app::settings::{self, RefinementConfig};
 use crate::evaluation::planar_errors;
 use crate::file_path::FilePath;
 use crate::geometry::{Pose3, StampedPose, TriangleMesh, pose2_from_pose3};
-use crate::georeference::write_geojson;
+use crate::georeference::{Georeference, write_geojson};
 use crate::map::MappingPath;
 use crate::map::files::mesh_file;
 use crate::recording::{Frame, scan_files};
@@ -127,6 +127,7 @@ fn export_map(args: &ExportArgs, context: &Context) -> Result<Option<TilesReport
     if args.glb.is_some() {
         let mut model = Model::default();
         model.add_mesh("map", &mesh);
+        model.georeference = georeference(path.as_ref()).cloned();
         write_model(args, &model)?;
     }
     if let Some(file) = &args.geojson {
@@ -142,6 +143,11 @@ fn export_map(args: &ExportArgs, context: &Context) -> Result<Option<TilesReport
     tiles::write(args, &mesh, path.as_ref(), context)
 }
 
+/// The place of a map on the Earth, if its path has one.
+fn georeference(path: Option<&MappingPath>) -> Option<&Georeference> {
+    path?.georeference.as_ref()
+}
+
 /// Writes a path in a map as one on the Earth.
 fn write_path(
     file: &Path,
@@ -149,8 +155,7 @@ fn write_path(
     path: Option<&MappingPath>,
     stretches: &[Vec<StampedPose>],
 ) -> Result<()> {
-    let georeference = path.and_then(|path| path.georeference.as_ref());
-    let georeference = georeference.with_context(|| {
+    let georeference = georeference(path).with_context(|| {
         format!(
             "the place of {} on the Earth is not known; build it with --gnss SOURCE",
             map.display()
@@ -176,7 +181,9 @@ fn export_result(args: &ExportArgs, context: &Context) -> Result<Option<TilesRep
     )?;
     let (mesh, path) = mesh_file::read(&config.map_input.map_file)?;
     if args.glb.is_some() {
-        write_model(args, &model_of(&mesh, &results)?)?;
+        let mut model = model_of(&mesh, &results)?;
+        model.georeference = georeference(path.as_ref()).cloned();
+        write_model(args, &model)?;
     }
     if let Some(log) = &args.mcap {
         let frames = match args.points {
@@ -187,6 +194,7 @@ fn export_result(args: &ExportArgs, context: &Context) -> Result<Option<TilesRep
             results: &results,
             frames: frames.as_deref(),
             mesh: Some(&mesh),
+            georeference: georeference(path.as_ref()),
             max_points: args.points,
         };
         write_log(log, &run, context)?;

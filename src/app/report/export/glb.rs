@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 
 use crate::app::report::plotting::color::Rgb;
 use crate::geometry::{Pose3, TriangleMesh};
+use crate::georeference::Georeference;
 
 /// Component types of glTF.
 const UNSIGNED_BYTE: u32 = 5121;
@@ -64,6 +65,8 @@ pub struct Model {
     accessors: Vec<Value>,
     views: Vec<Value>,
     binary: Vec<u8>,
+    /// The place of the map on the Earth, if it is known.
+    pub georeference: Option<Georeference>,
 }
 
 impl Model {
@@ -114,8 +117,13 @@ impl Model {
         let root =
             json!({ "name": "map", "rotation": [-half, 0.0, 0.0, half], "children": children });
         let nodes: Vec<Value> = self.nodes.iter().cloned().chain([root]).collect();
+        let mut asset =
+            json!({ "version": "2.0", "generator": concat!("fpmcl ", env!("CARGO_PKG_VERSION")) });
+        if let Some(georeference) = &self.georeference {
+            asset["extras"] = json!({ "georeference": georeference });
+        }
         let mut json = serde_json::to_vec(&json!({
-            "asset": { "version": "2.0", "generator": concat!("fpmcl ", env!("CARGO_PKG_VERSION")) },
+            "asset": asset,
             "scene": 0,
             "scenes": [{ "nodes": [children.len()] }],
             "nodes": nodes,

@@ -32,6 +32,7 @@ use crate::app::report::results::{Column, LocalizationResults, stretches};
 use crate::evaluation::planar_errors;
 use crate::evaluation::trust::Axes;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3, pose3_from_pose2};
+use crate::georeference::Georeference;
 use crate::lidar::Motion;
 use crate::localization::State;
 use crate::recording::{Frame, RecordingError};
@@ -47,6 +48,8 @@ pub struct RunLog<'a> {
     pub frames: Option<&'a [Frame]>,
     /// Map; `None` for a log without it.
     pub mesh: Option<&'a TriangleMesh>,
+    /// The place of the map on the Earth, if it is known.
+    pub georeference: Option<&'a Georeference>,
     /// Largest number of points per scan: of larger ones, points at even distances in the file.
     pub max_points: usize,
 }
@@ -60,6 +63,9 @@ pub fn write_mcap(
     let results = run.results;
     let poses = Trajectories::of(results)?;
     let mut log = McapSink::new(writer)?;
+    if let Some(georeference) = run.georeference {
+        log.write_georeference(georeference)?;
+    }
     let log: &mut dyn MessageSink = &mut log;
     let assumed = || {
         results

@@ -7,11 +7,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
 use foxglove::{Encode, Schema};
-use mcap::records::MessageHeader;
+use mcap::records::{MessageHeader, Metadata};
 use mcap::{WriteOptions, Writer};
 use serde_json::Value;
 
 use crate::files::GrowingFile;
+use crate::georeference::Georeference;
 
 /// An encoded message.
 pub struct Message<'a> {
@@ -93,6 +94,17 @@ impl<W: Write + Seek> McapSink<W> {
             channels: BTreeMap::new(),
             sequence: 0,
         })
+    }
+}
+
+impl<W: Write + Seek> McapSink<W> {
+    /// Writes the place of the map on the Earth, as JSON in the metadata `map`.
+    pub fn write_georeference(&mut self, georeference: &Georeference) -> Result<()> {
+        let text = serde_json::to_string(georeference)?;
+        Ok(self.writer.write_metadata(&Metadata {
+            name: "map".to_owned(),
+            metadata: BTreeMap::from([("georeference".to_owned(), text)]),
+        })?)
     }
 }
 
