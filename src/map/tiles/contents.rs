@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use super::file::{ENDING, INDEX, INDEX_MAGIC, TILE_MAGIC};
-use crate::files::{UnlockedOnDrop, require_no_link, require_own};
+use crate::files::{Place, UnlockedOnDrop, require_no_link, require_own};
 use crate::map::places::panorama_file::MAGIC as PANORAMA_MAGIC;
 
 /// Ending of the names of files of panoramas.
@@ -41,6 +41,7 @@ pub(crate) struct CacheFile {
 /// The files of a cache, without those of others; none where there is no folder.
 pub(crate) fn files_of(folder: &Path) -> io::Result<Vec<CacheFile>> {
     require_no_link(folder)?;
+    Place::of(&folder.join(INDEX))?;
     let entries = match fs::read_dir(folder) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         entries => entries?,

@@ -20,7 +20,7 @@ use super::file::{
 };
 use super::grid::{TileIndex, triangles_of_tiles};
 use crate::files::{
-    UnlockedOnDrop, remove_abandoned, require_no_link, require_own, write_atomically,
+    UnlockedOnDrop, claim_folder, remove_abandoned, require_no_link, require_own, write_atomically,
 };
 use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
@@ -223,6 +223,8 @@ impl TileStore {
         let stamp = source.stamp();
         require_own_index(folder)?;
         fs::create_dir_all(folder)?;
+        // What replaces it while the tiles are made is not followed.
+        claim_folder(folder)?;
         remove_abandoned(folder)?;
         let mut triangles_of = triangles_of_tiles(mesh, side_m);
         let ground_of = ground_of_tiles(mesh, is_ground, side_m);
@@ -262,6 +264,7 @@ impl TileStore {
             path: own_path,
             tiles,
         };
+        require_own_index(folder)?;
         write_atomically(&folder.join(INDEX), |out| out.write_all(&index.encode()))?;
         remove_others(folder, stamp)?;
         let (folder, in_use) = (folder.to_owned(), in_use(folder));
@@ -856,6 +859,29 @@ mod tests {
         crate::map::files::ply::write(&file, &moved, Some(&path())).unwrap();
         assert!(make().unwrap().is_none());
         assert!(open(&file).is_none());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_that_replaces_the_folder_while_tiles_are_made_is_not_followed() {
+        let (folder, file) = saved();
+        let (tiles, mine) = (folder_of(&file), folder.path().join("mine"));
+        fs::create_dir(&mine).unwrap();
+        fs::write(mine.join(INDEX), "mine").unwrap();
+        let is_ground = |triangle| {
+            if !tiles.is_symlink() {
+                fs::rename(&tiles, folder.path().join("moved")).unwrap();
+                std::os::unix::fs::symlink(&mine, &tiles).unwrap();
+            }
+            MeshView::is_red(&street(), triangle)
+        };
+        let source = TileStore::source(&file, false, 100.0).unwrap();
+        let made = TileStore::make(&file, &tiles, source, &street(), &is_ground, Some(path()));
+        let error = made.err().unwrap().to_string();
+        assert!(error.contains("was replaced"), "{error}");
+        let found: Vec<_> = fs::read_dir(&mine).unwrap().collect();
+        assert_eq!(found.len(), 1);
+        assert_eq!(fs::read_to_string(mine.join(INDEX)).unwrap(), "mine");
     }
 
     #[test]
