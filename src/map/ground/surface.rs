@@ -15,6 +15,7 @@
 //! 500 m are clipped to the bounds of the others; those around them are compared with each other, in a second grid.
 
 use std::collections::HashMap;
+use std::ops::Range;
 
 use glam::{DVec3, Vec3};
 use nalgebra::Point2;
@@ -65,6 +66,12 @@ struct CellSurface {
     /// Lowest and highest height [m].
     low_m: f32,
     high_m: f32,
+}
+
+impl CellSurface {
+    fn cell(&self) -> (i32, i32) {
+        (self.column, self.row)
+    }
 }
 
 /// The ground of a mesh or a cloud.
@@ -187,8 +194,7 @@ impl GroundSurface {
 
     /// Whether a position is on a surface of the ground.
     fn contains(&self, position: Vec3) -> bool {
-        let (column, row) = cell_of(position, self.cell_m);
-        self.in_cell(column, row).any(|index| {
+        self.in_cell(cell_of(position, self.cell_m)).any(|index| {
             let surface = &self.surfaces[index];
             self.is_ground[index] && (surface.low_m..=surface.high_m).contains(&position.z)
         })
@@ -215,10 +221,19 @@ impl GroundSurface {
         ground
     }
 
-    /// Surfaces of a cell.
-    fn in_cell(&self, column: i32, row: i32) -> impl Iterator<Item = usize> + use<> {
-        let (first, count) = self.cells.get(&(column, row)).copied().unwrap_or_default();
+    /// Surfaces of a cell, from the lowest.
+    fn in_cell(&self, cell: (i32, i32)) -> Range<usize> {
+        let (first, count) = self.cells.get(&cell).copied().unwrap_or_default();
         first as usize..(first + count) as usize
+    }
+
+    /// Surfaces of a cell that reach above one height and begin below another one [m].
+    fn between(&self, cell: (i32, i32), low_m: f32, high_m: f32) -> Range<usize> {
+        let all = self.in_cell(cell);
+        let surfaces = &self.surfaces[all.clone()];
+        let first = surfaces.partition_point(|surface| surface.high_m <= low_m);
+        let end = surfaces.partition_point(|surface| surface.low_m < high_m);
+        all.start + first..all.start + end.max(first)
     }
 
     /// Component of each surface, as one of its surfaces.
@@ -229,17 +244,14 @@ impl GroundSurface {
                 let distance_m =
                     self.cell_m as f32 * ((columns * columns + rows * rows) as f32).sqrt();
                 let step_m = scale_of(self.cell_m) * STEP_M + STEP_PER_M * distance_m;
-                for other in self.in_cell(surface.column + columns, surface.row + rows) {
-                    let neighbour = &self.surfaces[other];
-                    let apart_m =
-                        (surface.low_m - neighbour.high_m).max(neighbour.low_m - surface.high_m);
-                    if apart_m < step_m {
-                        let (a, b) = (
-                            root(&mut parents, index as u32),
-                            root(&mut parents, other as u32),
-                        );
-                        parents[a.max(b) as usize] = a.min(b);
-                    }
+                let cell = (surface.column + columns, surface.row + rows);
+                let [low_m, high_m] = [surface.low_m - step_m, surface.high_m + step_m];
+                for other in self.between(cell, low_m, high_m) {
+                    let (a, b) = (
+                        root(&mut parents, index as u32),
+                        root(&mut parents, other as u32),
+                    );
+                    parents[a.max(b) as usize] = a.min(b);
                 }
             }
         }
@@ -256,23 +268,40 @@ impl GroundSurface {
         for &component in components {
             cells[component as usize] += 1;
         }
+        // A cell may have as many surfaces as the mesh has triangles: none is searched one by one.
+        let mut sorted = components.to_vec();
+        let mut lowest_large: HashMap<(i32, i32), Vec<usize>> = HashMap::new();
+        for of_cell in self.surfaces.chunk_by(|a, b| a.cell() == b.cell()) {
+            let all = self.in_cell(of_cell[0].cell());
+            sorted[all.clone()].sort_unstable();
+            // The lowest surface of a large component, and the lowest of another one.
+            let mut lowest: Vec<usize> = vec![];
+            for index in all {
+                let component = components[index];
+                let is_other = |&it: &usize| components[it] != component;
+                if cells[component as usize] >= MIN_CELLS && lowest.iter().all(is_other) {
+                    lowest.push(index);
+                }
+                if lowest.len() == 2 {
+                    break;
+                }
+            }
+            lowest_large.insert(of_cell[0].cell(), lowest);
+        }
         for (index, surface) in self.surfaces.iter().enumerate() {
             let own = components[index];
-            let is_own = |other: usize| components[other] == own;
-            let has_own = |(columns, rows): (i32, i32)| {
-                let mut others = self.in_cell(surface.column + columns, surface.row + rows);
-                others.any(is_own)
+            let beside = |(columns, rows)| (surface.column + columns, surface.row + rows);
+            let has_own = |offset| {
+                let others = &sorted[self.in_cell(beside(offset))];
+                others.binary_search(&own).is_ok()
             };
             if [(1, 0), (-1, 0), (0, 1), (0, -1)].into_iter().all(has_own) {
                 continue;
             }
-            let has_below = |(columns, rows): (i32, i32)| {
-                let mut others = self.in_cell(surface.column + columns, surface.row + rows);
-                others.any(|other| {
-                    !is_own(other)
-                        && cells[components[other] as usize] >= MIN_CELLS
-                        && self.surfaces[other].high_m < surface.low_m - below_m
-                })
+            let has_below = |offset| {
+                let lowest = lowest_large.get(&beside(offset)).into_iter().flatten();
+                let mut others = lowest.filter(|&&other| components[other] != own);
+                others.any(|&other| self.surfaces[other].high_m < surface.low_m - below_m)
             };
             rim[own as usize] += 1;
             above[own as usize] += u32::from(cells_within(RIM_CELLS).any(has_below));
@@ -463,6 +492,16 @@ mod tests {
             assert_eq!(found, [true, true, false, false], "{side}");
             assert_eq!(ground.cell_m, CELL_M);
         }
+    }
+
+    #[test]
+    fn a_stack_of_very_many_sheets_is_looked_at_once() {
+        // Each surface with each other one would be 10^10 pairs.
+        let sheets = (0..100_000_u32).map(|level| ([0.0, 0.0, 1.2, 1.2], 0.5 * level as f32));
+        let floor = ([-20.0, -20.0, 20.0, 20.0], -3.0);
+        let rectangles: Vec<_> = std::iter::once(floor).chain(sheets).collect();
+        let (found, _) = ground_of_rectangles(&rectangles);
+        assert_eq!(found.iter().filter(|&&is_ground| is_ground).count(), 2);
     }
 
     #[test]
