@@ -37,6 +37,8 @@ fn distances_m(geojson: &Value, fixes: &GeodeticFixes) -> [f64; 2] {
     let coordinates = geojson["geometry"]["coordinates"].as_array().unwrap();
     let times_s = geojson["properties"]["times_s"].as_array().unwrap();
     assert_eq!(geojson["geometry"]["type"], "LineString");
+    // Sydney.
+    assert_eq!(geojson["properties"]["georeference"]["utm"]["number"], 56);
     assert_eq!(coordinates.len(), times_s.len());
     let mut largest_m = [0.0_f64; 2];
     for (coordinate, time_s) in coordinates.iter().zip(times_s) {
@@ -104,6 +106,21 @@ fn a_drive_in_a_map_on_the_earth_is_where_its_receiver_was() {
         &["export", "out/localization.npz", "--geojson", "run.geojson"],
     );
     require_near(&folder.join("run.geojson"), &fixes(2));
+    // Models and logs have the place of the map, too.
+    for (input, more) in [
+        ("map.ply", &["--glb", "map.glb"][..]),
+        (
+            "out/localization.npz",
+            &["--mcap", "run.mcap", "--points", "0"],
+        ),
+    ] {
+        run(folder, &[&["export", input], more].concat());
+        let bytes = fs::read(folder.join(more[1])).unwrap();
+        let text = String::from_utf8_lossy(&bytes);
+        let utm = text.find("georeference").map(|at| &text[at..]);
+        let utm = utm.and_then(|text| text.split("\"number\":").nth(1));
+        assert!(utm.is_some_and(|text| text.starts_with("56")), "{input}");
+    }
 
     // Poses from the scans are where the receiver was, too.
     let odometry = ["odometry", "street/drive_1", "--output", "poses"];
