@@ -150,7 +150,7 @@ fn poses_are_level_with_a_sensor_and_as_before_without_or_with_a_wrong_one() {
     // A table that is none.
     fs::write(folder.join("imu.csv"), "time,speed\n0,1\n").unwrap();
     let refused = odometry("refused").with("--imu=imu.csv");
-    refused.fails_with(&["the header `time,speed`"]);
+    refused.fails_with(&["the first row `time,speed`"]);
 }
 
 /// A walk of 55 m, the sensor turned by up to 30 degrees, with beams from 45 degrees up to 45 degrees down.

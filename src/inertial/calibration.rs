@@ -250,9 +250,13 @@ struct Fit {
     sigma_rad: f64,
     /// Decrease of the squares by a reflection, in variances.
     mirror_gain: f64,
-    /// What the rates of the sensor are in those of the lidar, about any axes, and its standard deviation (unitless).
-    scale: [f64; 2],
-    /// Share of the squares that remains if that is taken into account.
+    /// Ratio of the rates of the sensor to those of the lidar, about any axes, and its bounds: the lower one if all noise is that
+    /// of the lidar, the upper one if all is that of the sensor (unitless).
+    scale: f64,
+    scale_bounds: [f64; 2],
+    /// Relative standard deviation of the ratio.
+    scale_sigma: f64,
+    /// Share of the squares that remains if the ratio is taken into account.
     remaining_of_scaled: f64,
 }
 
@@ -284,12 +288,10 @@ impl Fit {
         // Information of a small rotation: Σ |y|² − y yᵀ. Neighbouring errors are correlated: four count as one.
         let information = (Matrix3::identity() * squares_y - spread) / (4.0 * variance);
         let least = information.symmetric_eigenvalues().min().max(1e-12);
-        // Umeyama's c, by which the rates of the sensor are multiplied.
-        let aligned = (free.transpose() * common).trace().max(0.0);
-        let factor = (aligned / squares_y.max(1e-18)).max(1e-6);
-        let squares_of_scaled = (squares_x - factor * aligned).max(0.0);
-        let remaining_of_scaled = squares_of_scaled / squares_x.max(1e-18);
-        let sigma = (4.0 * squares_of_scaled / (3.0 * count * squares_y.max(1e-18))).sqrt();
+        // Umeyama's c is aligned / squares_y.
+        let aligned = (free.transpose() * common).trace().max(1e-18);
+        let [squares_x, squares_y] = [squares_x, squares_y].map(|squares| squares.max(1e-18));
+        let remaining_of_scaled = (1.0 - aligned / squares_x * (aligned / squares_y)).max(0.0);
         Self {
             lidar_from_imu,
             bias_rad_s: mean_y - lidar_from_imu.inverse() * mean_x,
@@ -297,7 +299,9 @@ impl Fit {
             signals_rad_s: [squares_x, squares_y].map(root),
             sigma_rad: least.sqrt().recip(),
             mirror_gain: (remaining(&free) - remaining(&mirrored)) / variance,
-            scale: [factor.recip(), sigma / factor.powi(2)],
+            scale: (squares_y / squares_x).sqrt(),
+            scale_bounds: [aligned / squares_x, squares_y / aligned],
+            scale_sigma: (4.0 * remaining_of_scaled / (3.0 * count)).sqrt(),
             remaining_of_scaled,
         }
     }
@@ -324,9 +328,10 @@ impl Fit {
         /// Largest error of the scale: three times that of an MPU-6050 by its data sheet, 3 % (unitless).
         const MAX_ERROR: f64 = 0.1;
         const SIGMAS: f64 = 3.0;
-        let [scale, sigma] = self.scale;
+        let [least, most] = self.scale_bounds;
+        let margin = MAX_ERROR + SIGMAS * self.scale_sigma;
         self.remaining_of_scaled <= MAX_REMAINING
-            && (scale - 1.0).abs() > MAX_ERROR + SIGMAS * sigma
+            && (least > 1.0 + margin || most * (1.0 + margin) < 1.0)
     }
 
     /// The rejection of a sensor whose rates are others, unless its axes are turned.
@@ -353,8 +358,7 @@ impl Fit {
             return Err(ImuRejection::Mirrored);
         }
         if self.is_scaled() {
-            let [scale, _] = self.scale;
-            return Err(ImuRejection::Scaled { scale });
+            return Err(ImuRejection::Scaled { scale: self.scale });
         }
         if !self.is_explained() {
             return Err(self.unexplained(None));

@@ -191,6 +191,18 @@ fn a_wrong_sensor_is_refused_with_its_reason() {
         };
         assert_relative_eq!(found, scale, max_relative = 0.02);
     }
+    // Noise is no scale.
+    let mut rng = StdRng::seed_from_u64(5);
+    let mut vibrating = imu(car, 0.0);
+    for sample in &mut vibrating {
+        let mut deviate = || -> f64 { StandardNormal.sample(&mut rng) };
+        sample.rate_rad_s += Vector3::new(deviate(), deviate(), deviate()) * 0.3;
+    }
+    let found = estimate(vibrating, &noisy(car), Some(mounting()));
+    assert!(
+        !matches!(found, Err(ImuRejection::Scaled { .. })),
+        "{found:?}"
+    );
     // A range of 0.2 rad/s.
     let mut clipped = imu(car, 0.0);
     for sample in &mut clipped {

@@ -123,7 +123,7 @@ fn a_calibration_ends_when_the_sensor_is_known_or_contradicts_the_scans() {
     assert!(number < 80 && verdict.is_ok(), "{number} {verdict:?}");
     let (_, verdict) = ended(imu(8, 3.0));
     assert!(
-        matches!(verdict, Err(ImuRejection::Unexplained { .. })),
+        matches!(verdict, Err(ImuRejection::Scaled { .. })),
         "{verdict:?}"
     );
 }

@@ -232,11 +232,17 @@ fn words(row: &str) -> impl Iterator<Item = &str> {
         .filter(|word| !word.is_empty())
 }
 
-/// The axis that a name of a column ends with, before its unit: x, y or z, as in `wx`, `gyro_x [rad/s]` or `angular_velocity.x`.
+/// The axis in the name of a column: x, y or z, as in `wx`, `gyro_x_rad_s` or `angular_velocity.x`.
 fn axis_of(name: &str) -> Option<char> {
+    const STEMS: [&str; 11] = [
+        "", "a", "acc", "accel", "angvel", "g", "gyr", "gyro", "omega", "rate", "w",
+    ];
     let name = name.split(['[', '(']).next().unwrap_or_default().trim();
-    let is_axis = |part: &&str| part.len() <= 5 && part.ends_with(['x', 'y', 'z']);
-    let mut parts = name.split(['_', '.', ' ', '/', '-']).rev();
+    let is_axis = |part: &&str| {
+        let stem = part.strip_suffix(['x', 'y', 'z']);
+        stem.is_some_and(|stem| STEMS.contains(&stem))
+    };
+    let mut parts = name.split(['_', '.', ' ', '/', '-']);
     parts.find(is_axis)?.chars().last()
 }
 
@@ -287,15 +293,20 @@ impl Columns {
         };
         let is_force =
             |name: &str| !is_rate(name) && (has(name, &["acc", "force"]) || name.starts_with('a'));
-        let times = of(&|name| has(name, &["time", "stamp"]) || matches!(name, "t" | "sec"));
+        // Seconds with their fraction, if that is in no other column.
+        let is_whole = names.iter().any(|name| has(name, &["nsec", "nanosec"]));
+        let times = of(&|name| {
+            has(name, &["time", "stamp"]) || name == "t" || (name == "sec" && !is_whole)
+        });
         // Boreas and others begin with z.
         let by_axis = |found: Vec<usize>| -> Option<[usize; 3]> {
             let mut columns: [usize; 3] = found.try_into().ok()?;
             let axis = |column: &usize| axis_of(&names[*column]);
-            if columns.iter().all(|column| axis(column).is_some()) {
-                columns.sort_by_key(axis);
+            columns.sort_by_key(axis);
+            match columns.map(|column| axis(&column)) {
+                [Some('x'), Some('y'), Some('z')] | [None, None, None] => Some(columns),
+                _ => None,
             }
-            Some(columns)
         };
         let rates = by_axis(of(&is_rate))?;
         let forces = by_axis(of(&is_force))?;

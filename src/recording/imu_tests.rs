@@ -106,6 +106,13 @@ fn columns_have_the_order_of_the_header() {
             "{header}"
         );
     }
+    // Two axes of one name, and whole seconds without their fraction.
+    for header in [
+        "t,gyro_x,gyro_x,gyro_z,ax,ay,az",
+        "sec,nsec,gx,gy,gz,ax,ay,az",
+    ] {
+        assert!(read(&format!("{header}\n1,0,1,2,3,0,0,9.8\n")).is_err());
+    }
     // Columns without names that are more than seven may be anything.
     assert!(
         read("1,0,0,0,0,0,9.8,30,-5,40\n")
