@@ -23,7 +23,7 @@ pub fn read_text(path: &Path) -> Result<String, RecordingError> {
     text_of(bytes, path)
 }
 
-/// The bytes of a file as text, likewise.
+/// The bytes of a file as text, without the byte order mark.
 pub fn text_of(bytes: Vec<u8>, path: &Path) -> Result<String, RecordingError> {
     let mut text = memory::text_of(bytes).map_err(RecordingError::read(path))?;
     if text.starts_with('\u{feff}') {

@@ -34,16 +34,20 @@ pub fn read(path: &Path) -> Result<GeodeticFixes, RecordingError> {
 #[cfg(feature = "bags")]
 fn sentences(bytes: &[u8]) -> Option<String> {
     let text = String::from_utf8_lossy(bytes);
-    let is_sentence = |line: &str| {
-        let talker = line
-            .find('$')
-            .and_then(|start| line.get(start + 1..start + 3));
-        talker.is_some_and(|talker| talker.bytes().all(|letter| letter.is_ascii_alphanumeric()))
-    };
-    text.lines().any(is_sentence).then(|| {
-        let from_dollar = |line| str::find(line, '$').map_or(line, |start| &line[start..]);
-        text.lines().map(from_dollar).collect::<Vec<_>>().join("\n")
+    let has_sentence = text.lines().any(|line| sentence(line).is_some());
+    has_sentence.then(|| {
+        let lines = text.lines().map(|line| sentence(line).unwrap_or(line));
+        lines.collect::<Vec<_>>().join("\n")
     })
+}
+
+/// The sentence in a line, such as `$GPGGA,...`.
+#[cfg(feature = "bags")]
+fn sentence(line: &str) -> Option<&str> {
+    let found = &line[line.rfind('$')?..];
+    let (name, _) = found[1..].split_once(',')?;
+    let is_name = name.len() == 5 && name.bytes().all(|letter| letter.is_ascii_alphanumeric());
+    (is_name && !line.trim_start().starts_with('#')).then_some(found)
 }
 
 /// Reads rows of time [s], latitude, longitude [deg], height above the ellipsoid [m] and, optionally, the standard deviations
