@@ -239,6 +239,23 @@ pub fn claim_folder(path: &Path) -> io::Result<()> {
     Ok(())
 }
 
+/// A folder that is claimed while this lives, for work in it that ends.
+pub struct FolderClaim(PathBuf);
+
+impl FolderClaim {
+    /// As [`claim_folder`].
+    pub fn new(path: &Path) -> io::Result<Self> {
+        claim_folder(path)?;
+        Ok(Self(path.to_owned()))
+    }
+}
+
+impl Drop for FolderClaim {
+    fn drop(&mut self) {
+        lock(&CLAIMED).retain(|claimed| claimed.path != self.0);
+    }
+}
+
 /// An error if a claimed folder above `path` was replaced, or a folder between them is a link. Returns the claimed folder,
 /// if there is one, and the path from there to the folder of `path`.
 fn check_claimed(path: &Path) -> io::Result<Option<(Claimed, PathBuf)>> {

@@ -405,6 +405,9 @@ fn centroid([a, b, c]: [Vec3; 3]) -> Vec3 {
 
 #[cfg(test)]
 mod tests {
+    use rand::rngs::StdRng;
+    use rand::{RngExt as _, SeedableRng as _};
+
     use super::*;
 
     /// Two triangles of either winding over a rectangle at heights that rise along x.
@@ -492,6 +495,74 @@ mod tests {
             assert_eq!(found, [true, true, false, false], "{side}");
             assert_eq!(ground.cell_m, CELL_M);
         }
+    }
+
+    /// Which surfaces are ground, by comparing all pairs of them.
+    fn by_all_pairs(surfaces: &[CellSurface]) -> Vec<bool> {
+        let offset = |a: &CellSurface, b: &CellSurface| (b.column - a.column, b.row - a.row);
+        let square = |(x, y): (i32, i32)| x * x + y * y;
+        let mut parents: Vec<u32> = (0..surfaces.len() as u32).collect();
+        for (i, a) in surfaces.iter().enumerate() {
+            for (j, b) in surfaces.iter().enumerate() {
+                let square = square(offset(a, b));
+                let step_m = STEP_M + STEP_PER_M * CELL_M as f32 * (square as f32).sqrt();
+                let apart_m = (a.low_m - b.high_m).max(b.low_m - a.high_m);
+                if (1..=LINK_CELLS * LINK_CELLS).contains(&square) && apart_m < step_m {
+                    let [i, j] = [i, j].map(|index| root(&mut parents, index as u32));
+                    parents[i.max(j) as usize] = i.min(j);
+                }
+            }
+        }
+        let component: Vec<u32> = (0..surfaces.len() as u32)
+            .map(|index| root(&mut parents, index))
+            .collect();
+        let size = |own: u32| component.iter().filter(|&&it| it == own).count();
+        let others = || surfaces.iter().zip(&component);
+        let is_ground = |&own: &u32| {
+            let of_own = others().filter(|(_, it)| **it == own).map(|(a, _)| a);
+            let is_rim = |a: &&CellSurface| {
+                let has_own = |at| others().any(|(b, it)| *it == own && offset(a, b) == at);
+                ![(1, 0), (-1, 0), (0, 1), (0, -1)].into_iter().all(has_own)
+            };
+            let is_above = |a: &&CellSurface| {
+                others().any(|(b, it)| {
+                    *it != own
+                        && square(offset(a, b)) <= RIM_CELLS * RIM_CELLS
+                        && size(*it) >= MIN_CELLS as usize
+                        && b.high_m < a.low_m - BELOW_M
+                })
+            };
+            let rim: Vec<&CellSurface> = of_own.filter(is_rim).collect();
+            let above = rim.iter().filter(|a| is_above(a)).count();
+            size(own) >= MIN_CELLS as usize && 2 * above < rim.len().max(1)
+        };
+        component.iter().map(is_ground).collect()
+    }
+
+    #[test]
+    fn ground_is_what_comparing_all_pairs_of_surfaces_finds() {
+        let mut rng = StdRng::seed_from_u64(1);
+        let (mut found, mut others) = (0, 0);
+        for _ in 0..20 {
+            // A few sheets that slope and have holes.
+            let mut samples = Vec::new();
+            for _ in 0..5 {
+                let [along, across] = [0, 0].map(|_| rng.random_range(-0.2..0.2_f32));
+                let height_m = rng.random_range(0.0..3.0_f32);
+                let [width, length] = [0, 0].map(|_| rng.random_range(2..9));
+                for (column, row) in (0..width).flat_map(|x| (0..length).map(move |y| (x, y))) {
+                    let z = height_m + along * column as f32 + across * row as f32;
+                    if rng.random_bool(0.8) {
+                        samples.push((column, row, z));
+                    }
+                }
+            }
+            let ground = GroundSurface::of_samples(samples, CELL_M);
+            assert_eq!(ground.is_ground, by_all_pairs(&ground.surfaces));
+            found += ground.is_ground.iter().filter(|&&it| it).count();
+            others += ground.is_ground.iter().filter(|&&it| !it).count();
+        }
+        assert!(found > 100 && others > 100, "{found} {others}");
     }
 
     #[test]

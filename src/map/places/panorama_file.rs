@@ -17,7 +17,7 @@ use bytemuck::{Pod, Zeroable};
 
 use super::descriptor::PlaceDescriptor;
 use super::scan_panorama::{FAR, steps_of};
-use crate::files::{remove_abandoned, require_own, write_atomically};
+use crate::files::{folder_of, remove_abandoned, require_no_link, require_own, write_atomically};
 use crate::lidar::LidarModel;
 use crate::raycasting::{TileError, TileProblem};
 use crate::rendering::RenderError;
@@ -141,6 +141,7 @@ impl Panoramas {
         // What cannot be removed is reported when the file cannot be written.
         let _ = remove_abandoned(path);
         let write = || {
+            require_no_link(folder_of(path))?;
             require_own(path, Some(MAGIC))?;
             let described = write_atomically(path, |out| {
                 let mut hasher = crc32fast::Hasher::new();

@@ -20,7 +20,7 @@ use super::file::{
 };
 use super::grid::{TileIndex, triangles_of_tiles};
 use crate::files::{
-    UnlockedOnDrop, claim_folder, remove_abandoned, require_no_link, require_own, write_atomically,
+    FolderClaim, UnlockedOnDrop, remove_abandoned, require_no_link, require_own, write_atomically,
 };
 use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
@@ -224,7 +224,7 @@ impl TileStore {
         require_own_index(folder)?;
         fs::create_dir_all(folder)?;
         // What replaces it while the tiles are made is not followed.
-        claim_folder(folder)?;
+        let _claim = FolderClaim::new(folder)?;
         remove_abandoned(folder)?;
         let mut triangles_of = triangles_of_tiles(mesh, side_m);
         let ground_of = ground_of_tiles(mesh, is_ground, side_m);
