@@ -340,8 +340,7 @@ impl RangeRenderer for CpuRenderer {
         beams: &[Beam],
         within_m: f32,
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
-        let difference = RangeDifference::truncated(within_m);
-        let to_cast = CastBeams::new(beams, |beam| deciding_reach(beam, &difference));
+        let to_cast = CastBeams::new(beams, |beam| reach_near_end(beam, within_m));
         let grouping = Grouping::of(&[*map_from_lidar], &to_cast);
         let scene = self.scenes.scene(&[origin_of(map_from_lidar)]);
         let pieces: Vec<Vec<Hit>> = to_cast
@@ -391,13 +390,26 @@ impl RangeRenderer for CpuRenderer {
     }
 }
 
+/// Whether a beam has the ground near its end from almost any pose.
+fn ends_on_ground(beam: &Beam) -> bool {
+    beam.direction.z * beam.range_m < HIGHEST_GROUND_M
+}
+
+/// Range interval of the surfaces that are not farther than `within_m` from the end of a beam.
+fn reach_near_end(beam: &Beam, within_m: f32) -> Reach {
+    Reach {
+        until_m: (beam.range_m + within_m) * (1.0 + ROUNDING),
+        enough_m: (beam.range_m - within_m) * (1.0 - ROUNDING),
+        is_window: !ends_on_ground(beam),
+    }
+}
+
 /// Range interval that decides the exact cost of a beam: surfaces at whose range the cost has
 /// reached its limit do not matter. If all limits are equal, a ray without a surface near its
 /// measured range costs that limit, whatever is nearer.
 fn deciding_reach(beam: &Beam, difference: &RangeDifference) -> Reach {
     let measured_m = beam.range_m;
     let no_surface_costs_as_far = measured_m.min(difference.no_surface_m) == difference.short_m;
-    let is_on_ground = beam.direction.z * measured_m < HIGHEST_GROUND_M;
     Reach {
         until_m: if no_surface_costs_as_far {
             (measured_m + difference.short_m) * (1.0 + ROUNDING)
@@ -407,7 +419,7 @@ fn deciding_reach(beam: &Beam, difference: &RangeDifference) -> Reach {
         enough_m: (measured_m - difference.long_m) * (1.0 - ROUNDING),
         is_window: no_surface_costs_as_far
             && difference.long_m == difference.short_m
-            && !is_on_ground,
+            && !ends_on_ground(beam),
     }
 }
 
