@@ -446,7 +446,7 @@ fn stop_at_random_moments(
     tries: usize,
 ) -> Vec<Row> {
     // Other moments in every command.
-    let of_stage = reference.stage.name.bytes().map(u64::from).sum();
+    let of_stage: u64 = reference.stage.name.bytes().map(u64::from).sum();
     let mut rng = fpmcl::internals::stream(14, of_stage);
     let mut rows: Vec<Row> = (signals.iter())
         .map(|(name, _)| Row::new(name, reference.stage))
@@ -455,7 +455,8 @@ fn stop_at_random_moments(
         let (name, signal) = signals[number % signals.len()];
         let row = &mut rows[number % signals.len()];
         row.tries += 1;
-        let threads = ["--threads=1", "--threads=2"][number / signals.len() % 2];
+        let threads =
+            ["--threads=1", "--threads=2"][(of_stage as usize + number / signals.len()) % 2];
         let copy = Copy::of(reference.inputs.folder());
         let moment = reference.duration.mul_f64(1.05 * rng.random::<f64>());
         let child = start(reference.stage, &copy.path(), &[threads]);

@@ -32,7 +32,7 @@ const SIGNALS: [i32; 10] = [
 ];
 
 /// Time from the request to stop until the process ends.
-const GRACE: Duration = Duration::from_secs(1);
+const GRACE: Duration = Duration::from_millis(800);
 
 /// Longest time that the end of a process waits for a message: a terminal may be stopped, or a pipe full.
 const MESSAGE_WAIT: Duration = Duration::from_millis(200);
