@@ -89,7 +89,7 @@ impl Rotation {
         let (middle_rad, period_s) = (wrap_angle(self.start_rad + PI) as f32, self.period_s as f32);
         let time = |point: &Vec3| {
             let turns = sense * (fast_atan2(point.y, point.x) - middle_rad) / TAU;
-            // Of -1 to 1 turns; a call of `floor` would take as long as the rest.
+            // It is between -1 and 1; a call of `floor` would take as long as the rest.
             let whole = if turns >= 0.5 {
                 1.0
             } else if turns < -0.5 {

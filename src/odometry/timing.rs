@@ -148,7 +148,7 @@ fn period_of_order(scans: &[Scan], interval_s: f64) -> Option<f64> {
     Some(interval_s * TAU / if is_even { usual_rad } else { TAU })
 }
 
-/// Runs of the odometry over the same scans, which begin with one without times.
+/// Runs of the odometry over the same scans; the first one is without times.
 struct Runs<'a> {
     scans: &'a [Scan],
     config: OdometryConfig,
@@ -190,7 +190,7 @@ impl<'a> Runs<'a> {
         Ok(runs)
     }
 
-    /// Some times of points, and their mean residual [m].
+    /// A candidate with its mean residual [m].
     fn with(&self, timing: PointTiming) -> Result<(Option<PointTiming>, f64), TimingError> {
         Ok((Some(timing), self.run(Some(timing))?.0))
     }
@@ -249,7 +249,7 @@ impl<'a> Runs<'a> {
             let mut thinned = thinned.clone();
             thinned.times_s = match candidate {
                 None => vec![],
-                // Of the azimuths of the points alone, not of their order.
+                // It needs the azimuths of the points only, not their order.
                 Some(PointTiming::Rotation(rotation)) => rotation.point_times(&thinned.points),
                 Some(order) => (order.point_times(scan).into_iter())
                     .step_by(*step)
