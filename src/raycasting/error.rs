@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 /// A tile of a map cannot be read. Clones share the cause.
 #[derive(Clone, Debug, thiserror::Error)]
-#[error("the tile {}: {problem}; delete this file, or clear the cache of the map with `fpmcl info MAP --clear-cache`: it is made again", file.display())]
+#[error("the tile {}: {problem}; delete this file: it is made again from the map", file.display())]
 pub struct TileError {
     /// File of the tile.
     pub file: PathBuf,
