@@ -23,31 +23,10 @@ pub fn read(path: &Path) -> Result<GeodeticFixes, RecordingError> {
     }
     let bytes = memory::read_file(path).map_err(RecordingError::read(path))?;
     #[cfg(feature = "bags")]
-    if let Some(sentences) = sentences(&bytes) {
-        return nmea::parse(&sentences).checked(path);
+    if let Some(found) = nmea::parse(&String::from_utf8_lossy(&bytes)) {
+        return found.checked(path);
     }
     table(&text_of(bytes, path)?, path)?.checked(path)
-}
-
-/// The lines of a log with sentences of NMEA, each from its dollar sign on: loggers write times before them, and receivers other
-/// messages between them. `None` where no line has a sentence.
-#[cfg(feature = "bags")]
-fn sentences(bytes: &[u8]) -> Option<String> {
-    let text = String::from_utf8_lossy(bytes);
-    let has_sentence = text.lines().any(|line| sentence(line).is_some());
-    has_sentence.then(|| {
-        let lines = text.lines().map(|line| sentence(line).unwrap_or(line));
-        lines.collect::<Vec<_>>().join("\n")
-    })
-}
-
-/// The sentence in a line, such as `$GPGGA,...`.
-#[cfg(feature = "bags")]
-fn sentence(line: &str) -> Option<&str> {
-    let found = &line[line.rfind('$')?..];
-    let (name, _) = found[1..].split_once(',')?;
-    let is_name = name.len() == 5 && name.bytes().all(|letter| letter.is_ascii_alphanumeric());
-    (is_name && !line.trim_start().starts_with('#')).then_some(found)
 }
 
 /// Reads rows of time [s], latitude, longitude [deg], height above the ellipsoid [m] and, optionally, the standard deviations

@@ -9,10 +9,16 @@ use crate::recording::found_fixes::{FoundFixes, is_position};
 
 const DAY_S: f64 = 86_400.0;
 
-/// Reads all sentences; those that are damaged are counted.
-pub fn parse(text: &str) -> FoundFixes {
+/// Reads all sentences; those that are damaged are counted. `None` where no line has one.
+pub fn parse(text: &str) -> Option<FoundFixes> {
+    if !text.lines().any(|line| sentence(line).is_some()) {
+        return None;
+    }
     let mut found = FoundFixes::default();
-    let sentences = || text.lines().map(str::trim).filter(|line| !line.is_empty());
+    let sentences = || {
+        let lines = text.lines().map(|line| sentence(line).unwrap_or(line));
+        lines.map(str::trim).filter(|line| !line.is_empty())
+    };
     let parsed = |line: &str| parse_str(line).ok();
     // Sentences before the first date are of the same day as it, or of that before.
     let mut clock = Clock {
@@ -44,7 +50,15 @@ pub fn parse(text: &str) -> FoundFixes {
         }
         found.is_above_sea = true;
     }
-    found
+    Some(found)
+}
+
+/// The sentence in a line, such as `$GPGGA,...`. Loggers write times before them, and receivers other messages between them.
+fn sentence(line: &str) -> Option<&str> {
+    let found = &line[line.rfind('$')?..];
+    let (name, _) = found[1..].split_once(',')?;
+    let is_name = name.len() == 5 && name.bytes().all(|letter| letter.is_ascii_alphanumeric());
+    (is_name && !line.trim_start().starts_with('#')).then_some(found)
 }
 
 /// Separations of the geoid that were added to the heights of fixes.
