@@ -127,8 +127,7 @@ fn export_map(args: &ExportArgs, context: &Context) -> Result<Option<TilesReport
     if args.glb.is_some() {
         let mut model = Model::default();
         model.add_mesh("map", &mesh);
-        model.georeference = georeference(path.as_ref()).cloned();
-        write_model(args, &model)?;
+        write_model(args, model, path.as_ref())?;
     }
     if let Some(file) = &args.geojson {
         let driven = path.as_ref().map_or(&[][..], |it| &it.map_from_lidar);
@@ -181,9 +180,7 @@ fn export_result(args: &ExportArgs, context: &Context) -> Result<Option<TilesRep
     )?;
     let (mesh, path) = mesh_file::read(&config.map_input.map_file)?;
     if args.glb.is_some() {
-        let mut model = model_of(&mesh, &results)?;
-        model.georeference = georeference(path.as_ref()).cloned();
-        write_model(args, &model)?;
+        write_model(args, model_of(&mesh, &results)?, path.as_ref())?;
     }
     if let Some(log) = &args.mcap {
         let frames = match args.points {
@@ -302,7 +299,8 @@ fn colored_by_error(found: &[Pose3], truth: &[Pose3], trusted: &[bool]) -> (Stri
     (name, errors.iter().map(color).collect())
 }
 
-fn write_model(args: &ExportArgs, model: &Model) -> Result<()> {
+fn write_model(args: &ExportArgs, mut model: Model, path: Option<&MappingPath>) -> Result<()> {
+    model.georeference = georeference(path).cloned();
     args.glb.as_ref().map_or(Ok(()), |path| {
         output::write_file(path, |file| model.write(file))
     })

@@ -95,9 +95,7 @@ impl<W: Write + Seek> McapSink<W> {
             sequence: 0,
         })
     }
-}
 
-impl<W: Write + Seek> McapSink<W> {
     /// Writes the place of the map on the Earth, as JSON in the metadata `map`.
     pub fn write_georeference(&mut self, georeference: &Georeference) -> Result<()> {
         let text = serde_json::to_string(georeference)?;
