@@ -13,7 +13,7 @@ use super::loops::{Drift, Loop, common_share};
 use super::odometer::OdometryEstimate;
 use super::path_graph::{SUBMAP_LENGTH, loop_edges, move_along, odometry_edges};
 use super::pose_graph::{Edge, information, optimize};
-use super::voxel_map::{VoxelMap, pack};
+use super::voxel_map::{VoxelMap, cell_of, pack};
 use crate::geometry::{Pose3, TriangleMesh, distances_m};
 use crate::memory::{MemoryBudget, MemoryError};
 
@@ -163,10 +163,10 @@ fn surface_points(
     spacing_m: f64,
     budget: MemoryBudget,
 ) -> Result<Vec<DVec3>, MemoryError> {
-    let cell_of = |point: DVec3| (point / drive.range_m).floor().as_ivec3();
+    let near_cell_of = |point: DVec3| cell_of(point / drive.range_m);
     let mut near = HashSet::<u64>::default();
     for pose in &drive.poses {
-        let center = cell_of(pose.translation.vector.into());
+        let center = near_cell_of(pose.translation.vector.into());
         for index in 0..27 {
             near.insert(pack(
                 center + IVec3::new(index % 3, index / 3 % 3, index / 9) - 1,
@@ -193,8 +193,8 @@ fn surface_points(
             grid.map(|(i, j)| {
                 a + (i as f64 + 1.0 / 3.0) / count * u + (j as f64 + 1.0 / 3.0) / count * v
             })
-            .filter(|point| near.contains(&pack(cell_of(*point))))
-            .filter(|point| occupied.insert(pack((point / spacing_m).floor().as_ivec3()))),
+            .filter(|point| near.contains(&pack(near_cell_of(*point))))
+            .filter(|point| occupied.insert(pack(cell_of(point / spacing_m)))),
         );
         budget.require(
             "the surfaces of the older map",

@@ -12,7 +12,7 @@ use nalgebra::{Matrix3, Matrix6x3, Vector3, Vector6};
 use rayon::prelude::*;
 
 use super::drive::Drive;
-use super::voxel_map::pack;
+use super::voxel_map::{cell_of, pack};
 use crate::geometry::{PlaneSums, Pose3, RobustKernel};
 
 /// A plane through the points of several scans.
@@ -106,7 +106,7 @@ pub fn associate(
                 .iter()
                 .enumerate()
                 .map(move |(point, position)| Entry {
-                    voxel: pack((*position / edge_m).floor().as_ivec3()),
+                    voxel: pack(cell_of(*position / edge_m)),
                     row: number as u32,
                     point: point as u32,
                 })
