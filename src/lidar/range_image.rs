@@ -13,9 +13,6 @@ pub const NO_RETURN: f32 = f32::INFINITY;
 /// Point index of a pixel without a point.
 const NO_POINT: u32 = u32::MAX;
 
-/// Pixel of a point out of the image.
-const NO_PIXEL: u32 = u32::MAX;
-
 /// Range and point per pixel, row-major.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RangeImage {
@@ -39,16 +36,17 @@ impl RangeImage {
             point_indices: vec![NO_POINT; model.len()],
         };
         let projection = Projection::of(model);
-        let pixel = |point: &Vec3| {
-            let is_valid = model.accepts_range(point.length());
-            let pixel = is_valid.then(|| projection.pixel_of(*point)).flatten();
-            pixel.map_or(NO_PIXEL, |pixel| pixel as u32)
+        let range_and_pixel = |point: &Vec3| {
+            let range_m = point.length();
+            let pixel = (model.accepts_range(range_m)).then(|| projection.pixel_of(*point));
+            pixel.flatten().map(|index| (range_m, index))
         };
-        let pixels: Vec<u32> = points.par_iter().map(pixel).collect();
-        for (point_index, (&point, pixel)) in points.iter().zip(pixels).enumerate() {
-            let index = pixel as usize;
-            if pixel != NO_PIXEL && point.length() < image.ranges[index] {
-                image.ranges[index] = point.length();
+        let found: Vec<Option<(f32, usize)>> = points.par_iter().map(range_and_pixel).collect();
+        for (point_index, (&point, found)) in points.iter().zip(found).enumerate() {
+            if let Some((range_m, index)) = found
+                && range_m < image.ranges[index]
+            {
+                image.ranges[index] = range_m;
                 image.points[index] = point;
                 image.point_indices[index] = point_index as u32;
             }
