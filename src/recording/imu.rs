@@ -234,8 +234,8 @@ fn words(row: &str) -> impl Iterator<Item = &str> {
 
 /// The axis in the name of a column: x, y or z, as in `wx`, `gyro_x_rad_s` or `angular_velocity.x`.
 fn axis_of(name: &str) -> Option<char> {
-    const STEMS: [&str; 11] = [
-        "", "a", "acc", "accel", "angvel", "g", "gyr", "gyro", "omega", "rate", "w",
+    const STEMS: [&str; 12] = [
+        "", "a", "acc", "accel", "angvel", "force", "g", "gyr", "gyro", "omega", "rate", "w",
     ];
     let name = name.split(['[', '(']).next().unwrap_or_default().trim();
     let is_axis = |part: &&str| {

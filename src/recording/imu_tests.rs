@@ -89,6 +89,7 @@ fn columns_have_the_order_of_the_header() {
     for header in [
         "GPSTime,angvel_z,angvel_y,angvel_x,accelz,accely,accelx",
         "sec,gz,gy,gx,az,ay,ax",
+        "t,wz,wy,wx,forcez,forcey,forcex",
         "time_s,gyro_z_rad_s,gyro_y_rad_s,gyro_x_rad_s,acc_z_m_s2,acc_y_m_s2,acc_x_m_s2",
     ] {
         let samples = read(&format!(
