@@ -1,7 +1,8 @@
 //! Campaign of variants: recordings and maps that differ from what is usual, in one way each.
 //!
 //! Every call ends with a result or an error of one line, within the memory that it is given, and no frame that is
-//! called tracking is off by more than half a metre. A third is tried, with `FPMCL_VARIANTS` set all; `--nocapture` prints the table of `docs/reliability.md`.
+//! called tracking is off by more than half a metre. A third is tried, with `FPMCL_VARIANTS` set all; `--nocapture` prints
+//! the table of `docs/reliability.md`.
 
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]

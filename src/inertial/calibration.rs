@@ -9,8 +9,8 @@
 //! rotations about axes that change do not add up. A mirrored sensor is one that R with a determinant of -1
 //! fits far better.
 //!
-//! Umeyama, *Least-Squares Estimation of Transformation Parameters* (1991), for R and the scale, which must be about one; Furgale et al., *Unified Temporal
-//! and Spatial Calibration* (IROS 2013), for the problem.
+//! Umeyama, *Least-Squares Estimation of Transformation Parameters* (1991), for R and the scale, which must be about one;
+//! Furgale et al., *Unified Temporal and Spatial Calibration* (IROS 2013), for the problem.
 
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
@@ -250,9 +250,9 @@ struct Fit {
     sigma_rad: f64,
     /// Decrease of the squares by a reflection, in variances.
     mirror_gain: f64,
-    /// Ratio of the rates of the sensor to those of the lidar, about any axes, and its bounds: the lower one if all noise is that
-    /// of the lidar, the upper one if all is that of the sensor (unitless).
+    /// Ratio of the rates of the sensor to those of the lidar, about any axes (unitless).
     scale: f64,
+    /// Bounds of the ratio: the lower one if all noise is that of the sensor, the upper one if all is that of the lidar.
     scale_bounds: [f64; 2],
     /// Relative standard deviation of the ratio.
     scale_sigma: f64,

@@ -1,7 +1,8 @@
 //! Choice of the times of the points by the residuals of the odometry.
 //!
 //! Points that were measured while the sensor moved agree with the scans before only if they are compensated with
-//! their true times. The odometry runs once without times and once with each candidate; its residual has the least value for the right one. Near the right times it grows with the square of the error: the residual of compensated scans,
+//! their true times. The odometry runs once without times and once with each candidate; its residual has the least value
+//! for the right one. Near the right times it grows with the square of the error: the residual of compensated scans,
 //! candidates none (0), clockwise (1) and counter-clockwise (−1), is that of 0 by the same amount below both
 //! others, that of clockwise scans by one quarter of the whole range below the next. The scan of a sensor at rest has
 //! the same residual with all candidates. Scans in the order in which their points were measured, which start at

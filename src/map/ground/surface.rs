@@ -268,7 +268,7 @@ impl GroundSurface {
         for &component in components {
             cells[component as usize] += 1;
         }
-        // A cell may have as many surfaces as the mesh has triangles: none is searched one by one.
+        // A cell may have as many surfaces as the mesh has triangles: they are sorted and searched by bisection.
         let mut sorted = components.to_vec();
         let mut lowest_large: HashMap<(i32, i32), Vec<usize>> = HashMap::new();
         for of_cell in self.surfaces.chunk_by(|a, b| a.cell() == b.cell()) {
@@ -290,16 +290,16 @@ impl GroundSurface {
         }
         for (index, surface) in self.surfaces.iter().enumerate() {
             let own = components[index];
-            let beside = |(columns, rows)| (surface.column + columns, surface.row + rows);
+            let neighbour = |(columns, rows)| (surface.column + columns, surface.row + rows);
             let has_own = |offset| {
-                let others = &sorted[self.in_cell(beside(offset))];
+                let others = &sorted[self.in_cell(neighbour(offset))];
                 others.binary_search(&own).is_ok()
             };
             if [(1, 0), (-1, 0), (0, 1), (0, -1)].into_iter().all(has_own) {
                 continue;
             }
             let has_below = |offset| {
-                let lowest = lowest_large.get(&beside(offset)).into_iter().flatten();
+                let lowest = lowest_large.get(&neighbour(offset)).into_iter().flatten();
                 let mut others = lowest.filter(|&&other| components[other] != own);
                 others.any(|&other| self.surfaces[other].high_m < surface.low_m - below_m)
             };

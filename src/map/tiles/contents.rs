@@ -41,6 +41,7 @@ pub(crate) struct CacheFile {
 /// The files of a cache, without those of others; none where there is no folder.
 pub(crate) fn files_of(folder: &Path) -> io::Result<Vec<CacheFile>> {
     require_no_link(folder)?;
+    // An error where the folder was claimed and another one is in its place now.
     Place::of(&folder.join(INDEX))?;
     let entries = match fs::read_dir(folder) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
