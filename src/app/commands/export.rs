@@ -23,7 +23,7 @@ use crate::app::settings::{self, RefinementConfig};
 use crate::evaluation::planar_errors;
 use crate::file_path::FilePath;
 use crate::geometry::{Pose3, StampedPose, TriangleMesh, pose2_from_pose3};
-use crate::georeference::{Georeference, write_geojson};
+use crate::georeference::write_geojson;
 use crate::map::MappingPath;
 use crate::map::files::mesh_file;
 use crate::recording::{Frame, scan_files};
@@ -142,11 +142,6 @@ fn export_map(args: &ExportArgs, context: &Context) -> Result<Option<TilesReport
     tiles::write(args, &mesh, path.as_ref(), context)
 }
 
-/// The place of a map on the Earth, if its path has one.
-fn georeference(path: Option<&MappingPath>) -> Option<&Georeference> {
-    path?.georeference.as_ref()
-}
-
 /// Writes a path in a map as one on the Earth.
 fn write_path(
     file: &Path,
@@ -154,7 +149,8 @@ fn write_path(
     path: Option<&MappingPath>,
     stretches: &[Vec<StampedPose>],
 ) -> Result<()> {
-    let georeference = georeference(path).with_context(|| {
+    let georeference = path.and_then(|path| path.georeference.as_ref());
+    let georeference = georeference.with_context(|| {
         format!(
             "the place of {} on the Earth is not known; build it with --gnss SOURCE",
             map.display()
@@ -191,7 +187,7 @@ fn export_result(args: &ExportArgs, context: &Context) -> Result<Option<TilesRep
             results: &results,
             frames: frames.as_deref(),
             mesh: Some(&mesh),
-            georeference: georeference(path.as_ref()),
+            georeference: path.as_ref().and_then(|path| path.georeference.as_ref()),
             max_points: args.points,
         };
         write_log(log, &run, context)?;
@@ -300,7 +296,7 @@ fn colored_by_error(found: &[Pose3], truth: &[Pose3], trusted: &[bool]) -> (Stri
 }
 
 fn write_model(args: &ExportArgs, mut model: Model, path: Option<&MappingPath>) -> Result<()> {
-    model.georeference = georeference(path).cloned();
+    model.georeference = path.and_then(|path| path.georeference.clone());
     args.glb.as_ref().map_or(Ok(()), |path| {
         output::write_file(path, |file| model.write(file))
     })

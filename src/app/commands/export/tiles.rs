@@ -71,8 +71,8 @@ pub fn write(
     output::create_subfolder(&tiles_folder)?;
     remove_tiles(&tiles_folder)?;
     write_tiles(&tiles, &tiles_folder, context)?;
-    let georeference = super::georeference(path).map(serde_json::to_string);
-    let georeference = georeference.transpose()?;
+    let georeference = path.and_then(|path| path.georeference.as_ref());
+    let georeference = georeference.map(serde_json::to_string).transpose()?;
     let comments: Vec<String> = iter::once(format!("frame: {frame}"))
         .chain(georeference.map(|json| format!("georeference: {json}")))
         .collect();
