@@ -147,6 +147,13 @@ fn poses_are_level_with_a_sensor_and_as_before_without_or_with_a_wrong_one() {
         "saturated",
     );
 
+    // A table that ends half-way.
+    let table = fs::read_to_string(&imu).unwrap();
+    let half: Vec<&str> = table.lines().take(table.lines().count() / 2).collect();
+    fs::write(folder.join("half.csv"), half.join("\n")).unwrap();
+    let stderr = given("half").with("--imu=half.csv").succeeds().stderr;
+    assert!(stderr.contains("have none; their direction"), "{stderr}");
+
     // A table that is none.
     fs::write(folder.join("imu.csv"), "time,speed\n0,1\n").unwrap();
     let refused = odometry("refused").with("--imu=imu.csv");

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use glam::Vec3;
+use nalgebra::Vector3;
 
 use super::model::LidarModel;
 use crate::inertial::{Gyroscope, MeasuredRotation};
@@ -74,11 +75,12 @@ impl Scan {
         }
     }
 
-    /// The measured rotation around its moment, where there is one.
+    /// The measured rotation around its moment by the calibration of the sensor, where there is one.
     pub(crate) fn measured_rotation(&self) -> Option<MeasuredRotation> {
         Some(MeasuredRotation {
             gyroscope: self.gyroscope.clone()?,
             moment_s: self.time_s?,
+            bias_change_rad_s: Vector3::zeros(),
         })
     }
 

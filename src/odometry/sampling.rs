@@ -40,8 +40,13 @@ impl Sample {
         }
     }
 
-    /// Samples a scan for a sensor of range `range_m`.
-    pub fn new(scan: &Scan, range_m: f64, config: &OdometryConfig) -> Self {
+    /// Samples a scan for a sensor of range `range_m`, whose rotation around its moment may be measured.
+    pub fn new(
+        scan: &Scan,
+        rotation: Option<MeasuredRotation>,
+        range_m: f64,
+        config: &OdometryConfig,
+    ) -> Self {
         /// Larger times before or after the moment of the pose are errors [s].
         const MAX_TIME_S: f32 = 1.0;
         /// Largest range of a point, in ranges of the sensor.
@@ -64,7 +69,7 @@ impl Sample {
         Self {
             points,
             sweep,
-            rotation: scan.measured_rotation(),
+            rotation,
         }
     }
 

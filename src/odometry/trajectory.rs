@@ -185,7 +185,7 @@ impl TrajectoryBuilder {
         let range_m = sensor_range(scan);
         let sample = range_m.map_or_else(Sample::empty, |range_m| {
             let spacing_m = self.config.sample_spacing * config.voxel_share * range_m;
-            let sample = Sample::new(scan, range_m, config);
+            let sample = Sample::new(scan, scan.measured_rotation(), range_m, config);
             Sample {
                 points: sample.thinned(spacing_m),
                 ..sample

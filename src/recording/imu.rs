@@ -19,6 +19,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 #[cfg(feature = "bags")]
 use super::bags::{TopicKind, transform_between};
 use super::error::RecordingError;
+use super::frame::Frame;
 use super::open::Recording;
 #[cfg(feature = "bags")]
 use super::open::is_topic;
@@ -84,11 +85,29 @@ impl Recording {
             tracing::warn!(
                 "the inertial sensor is left out: the scans have no times; give them in times.txt"
             );
+        } else if let Some(part) = self.uncovered(&imu.samples) {
+            tracing::warn!("{part}");
         }
         Self {
             imu: Some(imu).filter(|_| self.has_times),
             ..self
         }
+    }
+
+    /// What to say where measurements end before the scans do, or begin after them.
+    fn uncovered(&self, samples: &ImuSamples) -> Option<String> {
+        /// More than clocks differ and a scan lasts [s].
+        const MARGIN_S: f64 = 1.0;
+        let [first_s, last_s] = samples.span_s();
+        let scans = self.dense_frames().len();
+        let is_without =
+            |frame: &&Frame| !(first_s - MARGIN_S..=last_s + MARGIN_S).contains(&frame.time_s);
+        let without = self.dense_frames().iter().filter(is_without).count();
+        (0 < without && without < scans).then(|| {
+            format!(
+                "the measurements of the inertial sensor end where scans go on: {without} of {scans} scans, outside of {first_s:.3} to {last_s:.3} s, have none; their direction of gravity is that of the others"
+            )
+        })
     }
 
     /// The same recording with a calibrated gyroscope: its scans have the rotations that it has measured.

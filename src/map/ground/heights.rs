@@ -11,10 +11,11 @@
 //! *Multi-Level Surface Maps for Outdoor Terrain Mapping and Loop Closing*, IROS 2006): the heights of
 //! a cell are clustered by single linkage, and each level is the mean of a cluster.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::fmt::Debug;
 use std::sync::{Arc, PoisonError, RwLock};
 
+use foldhash::HashMap;
 use glam::DVec3;
 use nalgebra::{Point2, Vector2, Vector3};
 
