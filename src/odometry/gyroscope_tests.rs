@@ -110,7 +110,7 @@ fn a_scan_that_does_not_fit_is_predicted_by_the_measured_rotation() {
 }
 
 #[test]
-fn a_bias_that_has_changed_is_followed() {
+fn a_bias_that_has_changed_is_estimated() {
     /// Scans that turn with the sensor and stay at the crossing.
     fn turning(number: usize) -> Pose3 {
         Pose3::from_parts(

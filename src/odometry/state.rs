@@ -1,6 +1,7 @@
 //! OdometerState between scans: the local map, the pose, the motion, and how well it predicts.
 //!
-//! The bias of a gyroscope changes while it warms up and along the way. Each registered scan shows the change,
+//! The bias of a gyroscope changes while it warms up and along the way. A registration that determines all of the motion shows the
+//! change,
 //!
 //! ```text
 //! b ← b − (Δt / τ) · log(R̂⁻¹ R) / Δt        R̂: measured rotation since the last one,  R: that of the registration
@@ -211,10 +212,10 @@ impl OdometerState {
             self.is_surprised = true;
             return None;
         }
-        if turn.is_some() && is_smooth && found.degenerate_directions.is_empty() {
+        if turn.is_some() && is_smooth && !is_searched && found.degenerate_directions.is_empty() {
             let predicted_from_found =
                 predicted.rotation.inverse() * found.odom_from_lidar.rotation;
-            self.follow_bias(&predicted_from_found, since_s);
+            self.update_bias(&predicted_from_found, since_s);
         }
         self.update(&found, &predicted, &sample, since_s, config);
         Some(Registered {
@@ -365,12 +366,17 @@ impl OdometerState {
         deviation.translation.vector.norm() <= most_m && deviation.rotation.angle() <= most_rad
     }
 
-    /// Follows the bias of the gyroscope by the difference of a registered rotation since the last scan from the measured one.
-    fn follow_bias(&mut self, predicted_from_found: &UnitQuaternion<f64>, since_s: f64) {
-        /// Time in which a change is followed [s]: it keeps less than 0.002 deg/s of a registration that errs by 0.05 deg, and
+    /// Estimates the change of the bias of the gyroscope from the difference of a registered rotation since the last scan and the
+    /// measured one, unless that is an outlier.
+    fn update_bias(&mut self, predicted_from_found: &UnitQuaternion<f64>, since_s: f64) {
+        /// Time constant [s]: it keeps less than 0.002 deg/s of a registration that errs by 0.05 deg, and
         /// is behind an MPU-6050 that warms by 1 K per minute (its data sheet: 20 deg/s over 125 K) by 0.08 deg/s.
-        const FOLLOWED_IN_S: f64 = 30.0;
-        self.bias_change_rad_s -= predicted_from_found.scaled_axis() / since_s.max(FOLLOWED_IN_S);
+        const TIME_CONSTANT_S: f64 = 30.0;
+        let turn = predicted_from_found.angle();
+        if turn.powi(2) > self.turn_variance(1.0) {
+            return;
+        }
+        self.bias_change_rad_s -= predicted_from_found.scaled_axis() / since_s.max(TIME_CONSTANT_S);
     }
 
     /// Takes over a registered scan.

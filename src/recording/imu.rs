@@ -19,7 +19,6 @@ use nalgebra::{UnitQuaternion, Vector3};
 #[cfg(feature = "bags")]
 use super::bags::{TopicKind, transform_between};
 use super::error::RecordingError;
-use super::frame::Frame;
 use super::open::Recording;
 #[cfg(feature = "bags")]
 use super::open::is_topic;
@@ -94,18 +93,18 @@ impl Recording {
         }
     }
 
-    /// What to say where measurements end before the scans do, or begin after them.
+    /// Warning if some scans are outside of the times of the measurements.
     fn uncovered(&self, samples: &ImuSamples) -> Option<String> {
-        /// More than clocks differ and a scan lasts [s].
+        /// Largest difference of clocks, and duration of a scan [s].
         const MARGIN_S: f64 = 1.0;
         let [first_s, last_s] = samples.span_s();
-        let scans = self.dense_frames().len();
-        let is_without =
-            |frame: &&Frame| !(first_s - MARGIN_S..=last_s + MARGIN_S).contains(&frame.time_s);
-        let without = self.dense_frames().iter().filter(is_without).count();
+        let covered = first_s - MARGIN_S..=last_s + MARGIN_S;
+        let frames = self.frames.iter().chain(&self.skipped);
+        let scans = frames.clone().count();
+        let without = frames.filter(|it| !covered.contains(&it.time_s)).count();
         (0 < without && without < scans).then(|| {
             format!(
-                "the measurements of the inertial sensor end where scans go on: {without} of {scans} scans, outside of {first_s:.3} to {last_s:.3} s, have none; their direction of gravity is that of the others"
+                "{without} of {scans} scans have no inertial measurements, which are from {first_s:.3} to {last_s:.3} s; give those of the whole drive"
             )
         })
     }
