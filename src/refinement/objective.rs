@@ -22,8 +22,10 @@ pub struct FrameObjective<'a> {
     pub renderer: &'a dyn RangeRenderer,
     /// Ground of the map.
     pub ground: &'a GroundMap,
-    /// The beams of the frame, lidar frame.
+    /// The beams of the frame whose ranges are compared, lidar frame.
     pub beams: &'a [Beam],
+    /// The beams of the frame that the last Gauss-Newton registers.
+    pub registered: &'a [Beam],
     /// Approximate height of the ground [m], which selects among several levels; `None` selects the
     /// lowest.
     pub level_m: Option<f64>,
@@ -211,6 +213,7 @@ mod tests {
                 renderer: self,
                 ground: &self.ground,
                 beams,
+                registered: beams,
                 level_m: None,
                 attitude: SensorAttitude::default(),
                 difference: RangeDifference::truncated(0.5),

@@ -16,7 +16,7 @@ use super::wide_search::{self, WideSearchConfig};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
 use crate::map::SensorAttitude;
-use crate::registration::{RegistrationConfig, RegistrationResult, register};
+use crate::registration::{RegistrationConfig, RegistrationResult, register_informative};
 use crate::rendering::RenderError;
 use crate::validation::{
     InvalidValue, Validate, in_range, nested, not_negative, positive, require,
@@ -53,6 +53,9 @@ pub struct FrameRefinementConfig {
     /// last centimetres.
     #[default(300)]
     pub swarm_beams: usize,
+    /// Number of beams, of which Gauss-Newton registers the 4,800 most informative ones, or all if these are fewer.
+    #[default(9600)]
+    pub registered_beams: usize,
     /// Gauss-Newton.
     pub gauss_newton: RegistrationConfig,
     /// The smoothing of the whole trajectory.
@@ -83,6 +86,7 @@ impl Validate for FrameRefinementConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("swarm", &self.swarm)?;
         in_range("swarm_beams", self.swarm_beams, 1..=1_000_000)?;
+        in_range("registered_beams", self.registered_beams, 1..=1_000_000)?;
         nested("gauss_newton", &self.gauss_newton)?;
         nested("wide_search", &self.wide_search)?;
         nested("smoothing", &self.smoothing)?;
@@ -308,9 +312,10 @@ fn finish(
     frame: &mut RefinedFrame,
     config: &FrameRefinementConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
-    let (renderer, beams) = (objective.renderer, objective.beams);
+    let (renderer, beams) = (objective.renderer, objective.registered);
     let start = &frame.map_from_lidar;
-    let Some(registered) = register(renderer, beams, start, &config.gauss_newton)? else {
+    let registered = register_informative(renderer, beams, start, &config.gauss_newton)?;
+    let Some(registered) = registered else {
         return Ok(None);
     };
     let cost_m = objective.costs_in_space(&[registered.map_from_lidar])?[0];
@@ -332,6 +337,7 @@ mod tests {
     use crate::geometry::Vec3;
     use crate::lidar::{LidarModel, RangeImage};
     use crate::map::world_for_tests::TestWorld;
+    use crate::registration::register;
     use crate::rendering::{RangeDifference, RangeRenderer, SurfaceHit};
 
     fn refine(method: Method, off: &Pose2, seed: u64) -> (RefinedFrame, Pose2) {

@@ -477,12 +477,15 @@ impl TrajectoryRefiner {
         rng: &mut Generator,
     ) -> Result<Option<Comparison>, RefinerError> {
         let observation = &self.config.observation;
-        let (count, road_share) = (observation.beams, observation.road_share);
-        let beams = choose_beams(image, count, road_share, &frame.attitude, rng);
+        let attitude = &frame.attitude;
+        let mut choose = |count| choose_beams(image, count, observation.road_share, attitude, rng);
+        let beams = choose(observation.beams);
+        let registered = choose(self.config.refinement.registered_beams);
         let mut objective = FrameObjective {
             renderer: &*self.map.renderer,
             ground: &self.map.ground,
             beams: &beams,
+            registered: &registered,
             level_m: frame.level_m,
             attitude: frame.attitude,
             difference: observation.difference(),

@@ -27,69 +27,18 @@
 //! Modelling by Registration of Multiple Range Images* (1992), for point to plane; Blais and Levine
 //! (1995) for projective association.
 
-use nalgebra::{Matrix2, Matrix3, Matrix6, Vector2, Vector6};
-use serde::{Deserialize, Serialize};
-use smart_default::SmartDefault;
+mod config;
+mod information;
+mod informative;
 
+use nalgebra::{Matrix3, Matrix6, Vector6};
+
+pub use self::config::RegistrationConfig;
+use self::information::{Horizontal, Residual};
 use crate::geometry::pose::exponential;
 use crate::geometry::{Pose3, Rigid3f, RobustKernel, azimuth_sector};
 use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
-use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
-
-/// Settings of the registration.
-///
-/// Defaults: our own values; from 1.5 degrees away it takes up to ten iterations.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
-#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
-#[serde(default, deny_unknown_fields)]
-pub struct RegistrationConfig {
-    /// Maximum number of Gauss-Newton iterations.
-    #[default(12)]
-    pub iterations: usize,
-    /// Scale c of the robust kernel: a residual of c has a weight of one quarter [m].
-    #[default(0.1)]
-    pub kernel_m: f64,
-    /// Step length below which the iteration has converged [m]; rotations count with a lever of ten
-    /// meters.
-    #[default(1e-3)]
-    pub tolerance_m: f64,
-    /// Number of azimuth sectors, the clusters of correlated residuals in the covariance.
-    #[default(24)]
-    pub sectors: usize,
-    /// Standard deviation per axis of an offset common to all visible surfaces [m]; residuals cannot
-    /// show it. The default is a thirtieth of the 9 cm cells of a map: simulated maps are off by 3
-    /// to 4 mm over tens of meters.
-    #[default(0.003)]
-    pub map_error_m: f64,
-    /// Standard deviation of the normals of the map, whose noise is no information on the position [rad]. The default is 3 mm
-    /// over the 9 cm of a cell. It is no key of a configuration.
-    #[default(0.03)]
-    #[serde(skip)]
-    pub normal_rad: f64,
-}
-
-impl RegistrationConfig {
-    /// The settings for a pose that is not certain, with twice the noise of the normals: where they are noisier than usual,
-    /// as on parts of a tunnel or of a motorway, they would confirm a wrong place.
-    pub(crate) fn cautious(&self) -> Self {
-        Self {
-            normal_rad: 2.0 * self.normal_rad,
-            ..self.clone()
-        }
-    }
-}
-
-impl Validate for RegistrationConfig {
-    fn validate(&self) -> Result<(), InvalidValue> {
-        in_range("iterations", self.iterations, 1..=1000)?;
-        positive("kernel_m", self.kernel_m)?;
-        not_negative("tolerance_m", self.tolerance_m)?;
-        in_range("sectors", self.sectors, 1..=10_000)?;
-        not_negative("map_error_m", self.map_error_m)?;
-        not_negative("normal_rad", self.normal_rad)
-    }
-}
 
 /// A registered pose with its covariance.
 #[derive(Clone, Debug, PartialEq)]
@@ -116,13 +65,6 @@ impl RegistrationResult {
         let axes = [0, 1, 5];
         Matrix3::from_fn(|row, column| in_map[(axes[row], axes[column])])
     }
-}
-
-/// The linearized residual of one beam.
-struct Residual {
-    value_m: f64,
-    jacobian: Vector6<f64>,
-    sector: usize,
 }
 
 /// Registers beams to the map, starting at `initial`; `None` if the beams do not determine the pose.
@@ -155,6 +97,33 @@ pub(crate) fn register(
         }
     }
     Ok(result)
+}
+
+/// Registers beams in two stages: 2,400 of them, then the 4,800 most informative ones, see [`informative::choose`]; fewer
+/// beams in one stage.
+pub(crate) fn register_informative(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    initial: &Pose3,
+    config: &RegistrationConfig,
+) -> Result<Option<RegistrationResult>, RenderError> {
+    const COARSE: usize = 2400;
+    const FINE: usize = 4800;
+    if beams.len() <= COARSE {
+        return register(renderer, beams, initial, config);
+    }
+    let coarse = RegistrationConfig {
+        tolerance_m: 10.0 * config.tolerance_m,
+        ..config.clone()
+    };
+    let step = beams.len().div_ceil(COARSE);
+    let some: Vec<Beam> = beams.iter().step_by(step).copied().collect();
+    let near = register(renderer, &some, initial, &coarse)?;
+    let near = near.map_or(*initial, |near| near.map_from_lidar);
+    let residuals = linearize(renderer, beams, &near, config)?;
+    let chosen = informative::choose(&residuals, FINE, config);
+    let chosen: Vec<Beam> = chosen.iter().map(|&beam| beams[beam]).collect();
+    register(renderer, &chosen, &near, config)
 }
 
 /// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second
@@ -196,16 +165,17 @@ fn linearize(
     let within_m = (GATE_ALONG * config.kernel_m) as f32;
     let hits = renderer.surfaces(pose, beams, within_m)?;
     let lidar_from_map = Rigid3f::from(&pose.inverse());
-    let residual = |(beam, hit): (&Beam, &Option<SurfaceHit>)| {
-        residual(beam, hit.as_ref()?, &lidar_from_map, config)
+    let residual = |(number, (beam, hit)): (usize, (&Beam, &Option<SurfaceHit>))| {
+        residual((number, beam), hit.as_ref()?, &lidar_from_map, config)
     };
-    Ok(beams.iter().zip(&hits).filter_map(residual).collect())
+    let pairs = beams.iter().zip(&hits).enumerate();
+    Ok(pairs.filter_map(residual).collect())
 }
 
 /// The linearized residual of one beam; `None` if its return is too far from the plane of the hit to be a
 /// correspondence.
 fn residual(
-    beam: &Beam,
+    (number, beam): (usize, &Beam),
     hit: &SurfaceHit,
     lidar_from_map: &Rigid3f,
     config: &RegistrationConfig,
@@ -221,6 +191,7 @@ fn residual(
     let lever = beam.point().cross(normal);
     let jacobian = [normal.x, normal.y, normal.z, lever.x, lever.y, lever.z];
     Some(Residual {
+        beam: number,
         value_m,
         jacobian: Vector6::from(jacobian.map(f64::from)),
         sector: azimuth_sector(beam.direction, config.sectors),
@@ -270,53 +241,6 @@ fn solve(
         .then_some((step, covariance))
 }
 
-/// What the scan shows of the horizontal position, without what the noise of the normals seems to show.
-struct Horizontal {
-    /// Directions in the lidar frame.
-    directions: Matrix2<f64>,
-    /// Information on each direction while all other components are estimated, too.
-    found: Vector2<f64>,
-    /// The part of it that is not noise, positive.
-    kept: Vector2<f64>,
-}
-
-impl Horizontal {
-    /// Splits the information of residuals; `noise` is the part of each direction that is not information. `None` if it is
-    /// singular.
-    fn new(information: &Matrix6<f64>, noise: f64) -> Option<Self> {
-        /// Share of its information that a direction keeps at least, so that the matrix stays positive definite.
-        const LEAST: f64 = 1e-3;
-        let covariance = information.try_inverse()?;
-        let horizontal = covariance.fixed_view::<2, 2>(0, 0).into_owned();
-        let eigen = horizontal.try_inverse()?.symmetric_eigen();
-        let kept = |found: f64| (found - noise).max(LEAST * found);
-        Some(Self {
-            directions: eigen.eigenvectors,
-            found: eigen.eigenvalues,
-            kept: eigen.eigenvalues.map(kept),
-        })
-    }
-
-    /// The information without that of the noise.
-    fn corrected(&self, information: &Matrix6<f64>) -> Matrix6<f64> {
-        let noise = Matrix2::from_diagonal(&(self.found - self.kept));
-        let mut corrected = *information;
-        let mut part = corrected.fixed_view_mut::<2, 2>(0, 0);
-        part -= self.directions * noise * self.directions.transpose();
-        corrected
-    }
-
-    /// A step without the directions of which only noise is known (Zhang, Kaess and Singh, *On Degeneracy of
-    /// Optimization-based State Estimation Problems*, 2016).
-    fn determined(&self, mut step: Vector6<f64>) -> Vector6<f64> {
-        let shares = Matrix2::from_diagonal(&self.kept.component_div(&self.found));
-        let mut part = step.fixed_rows_mut::<2>(0);
-        let moved = self.directions * shares * self.directions.transpose() * &part;
-        part.copy_from(&moved);
-        step
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
@@ -355,6 +279,25 @@ mod tests {
         let found = register(&world, &beams(&world, &truth), &lift(&world, &off), &config);
         let found = found.unwrap().unwrap().map_from_lidar;
         assert_relative_eq!(found, lift(&world, &truth), epsilon = 3e-3);
+    }
+
+    #[test]
+    fn the_most_informative_of_many_beams_find_the_pose_and_few_are_all_registered() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(5.0, 0.3, 0.1);
+        let off = lift(
+            &world,
+            &(truth * Pose2::new(Vector2::new(0.1, -0.08), 0.009)),
+        );
+        let config = RegistrationConfig::default();
+        let all: Vec<Beam> = world.scan(&truth).beams().collect();
+        assert!(all.len() > 6000, "{}", all.len());
+        let found = register_informative(&world, &all, &off, &config);
+        let found = found.unwrap().unwrap().map_from_lidar;
+        assert_relative_eq!(found, lift(&world, &truth), epsilon = 3e-3);
+        let few: Vec<Beam> = all.into_iter().step_by(11).collect();
+        let found = register_informative(&world, &few, &off, &config).unwrap();
+        assert_eq!(found, register(&world, &few, &off, &config).unwrap());
     }
 
     #[test]
