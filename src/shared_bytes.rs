@@ -112,6 +112,8 @@ impl fmt::Debug for SharedBytes {
 pub struct GrowingBytes {
     file: File,
     map: MmapMut,
+    /// Size of the part of the file that is mapped.
+    reserved: usize,
     len: usize,
 }
 
@@ -123,7 +125,12 @@ impl GrowingBytes {
     pub fn in_folder(folder: Option<&Path>, bytes: &[u8]) -> io::Result<Self> {
         let file = unnamed_file(folder)?;
         let map = MmapMut::map_anon(1)?;
-        let mut all = Self { file, map, len: 0 };
+        let mut all = Self {
+            file,
+            map,
+            reserved: 0,
+            len: 0,
+        };
         all.extend(bytes)?;
         Ok(all)
     }
@@ -131,16 +138,16 @@ impl GrowingBytes {
     /// Appends bytes; an error where the disk is full.
     pub fn extend(&mut self, bytes: &[u8]) -> io::Result<()> {
         let len = self.len + bytes.len();
-        let reserved = self.file.metadata()?.len() as usize;
-        if len > reserved {
+        if len > self.reserved {
             // Written, not only claimed: a page that a full disk cannot hold would end the process when it is touched.
-            let step = len.clamp(1 << 16, Self::LARGEST_STEP).max(len - reserved);
-            self.file.seek(SeekFrom::Start(reserved as u64))?;
+            let step = (len.clamp(1 << 16, Self::LARGEST_STEP)).max(len - self.reserved);
+            self.file.seek(SeekFrom::Start(self.reserved as u64))?;
             io::copy(&mut io::repeat(0).take(step as u64), &mut &self.file)?;
             #[expect(unsafe_code, reason = "another program could change the file")]
             // SAFETY: the file has no name, and no other handle.
             let map = unsafe { MmapMut::map_mut(&self.file) }?;
             self.map = map;
+            self.reserved += step;
         }
         self.map[self.len..len].copy_from_slice(bytes);
         self.len = len;

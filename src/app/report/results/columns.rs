@@ -130,12 +130,15 @@ impl<T> Default for Column<T> {
 impl<T: Pod> Clone for Column<T> {
     /// A long column has its copy in a file, too.
     fn clone(&self) -> Self {
-        let mut copy = Self {
-            folder: self.folder.clone(),
-            items: Items::InMemory(Vec::new()),
+        let folder = self.folder.clone();
+        let is_long = size_of_val(&**self) >= Self::MOST_BYTES;
+        let in_file = is_long
+            .then(|| GrowingBytes::in_folder(folder.as_deref(), bytemuck::cast_slice(self)).ok());
+        let items = match in_file.flatten() {
+            Some(bytes) => Items::InFile(bytes, PhantomData),
+            None => Items::InMemory(self.to_vec()),
         };
-        self.iter().for_each(|&item| copy.push(item));
-        copy
+        Self { folder, items }
     }
 }
 

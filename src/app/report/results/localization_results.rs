@@ -274,10 +274,13 @@ impl LocalizationResults {
             let column = column.as_ref()?;
             Some(rows.iter().map(|&row| column[row]).collect())
         }
-        let mut particles = self.particles.clone();
-        if !particles.is_empty() {
-            particles.frames = particles.frames.select(rows);
-        }
+        let particles = match &self.particles {
+            none if none.is_empty() => none.clone(),
+            all => ParticleLog {
+                frames: all.frames.select(rows),
+                ..*all
+            },
+        };
         let scan_outlines = self.scan_outlines.as_ref().map(|all| all.select(rows));
         let frames = rows.iter().map(|&row| self.frames[row]).collect();
         let times_are_assumed = self.times_are_assumed;

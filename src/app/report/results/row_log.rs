@@ -55,8 +55,11 @@ impl<T: Pod> RowLog<T> {
     #[must_use]
     pub fn select(&self, rows: &[usize]) -> Self {
         Self {
+            folder: self.folder.clone(),
+            file: self.file.clone(),
+            in_file: self.in_file,
+            last: self.last.clone(),
             rows: rows.iter().map(|&row| self.rows[row]).collect(),
-            ..self.clone()
         }
     }
 
