@@ -7,8 +7,9 @@ use nalgebra::Matrix3;
 use npyz::{DType, NpyFile, WriterBuilder as _};
 use zip::write::SimpleFileOptions;
 
+use super::localization_results::columns;
 use super::npz_writer::NpzWriter;
-use super::{LocalizationResults, ParticleLog, RowLog};
+use super::{Column, LocalizationResults, ParticleLog, RowLog};
 use crate::geometry::{Pose2, Pose3};
 
 fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
@@ -381,45 +382,65 @@ fn a_trajectory_without_particles_reads_back() {
 }
 
 #[test]
-fn a_file_that_is_written_frame_by_frame_holds_them_before_the_end() {
+fn a_file_written_frame_by_frame_has_its_particles_before_the_end_and_is_the_one_written_at_once() {
     const FRAMES: usize = 20_000;
+    const FIRST: usize = 3;
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("results.npz");
-    let mut results = LocalizationResults {
-        particles: ParticleLog::new(50, folder.path()),
-        scan_outlines: Some(RowLog::in_folder(folder.path())),
-        ..LocalizationResults::default()
-    };
-    let mut writer = results.writer(&path, &[3]).unwrap();
+    let mut all = results(FIRST..FIRST + FRAMES);
+    all.selected = Some(FRAMES + 1);
+    all.particles = ParticleLog::new(50, folder.path());
+    macro_rules! without_rows {
+        ($($name:ident),*) => {
+            LocalizationResults {
+                frames: Column::in_folder(folder.path()),
+                scan_outlines: Some(RowLog::in_folder(folder.path())),
+                $($name: Some(Column::in_folder(folder.path())),)*
+                ..all.select(&[])
+            }
+        };
+    }
+    let mut growing = columns!(without_rows);
+    growing.selected = all.selected;
+    let mut writer = growing.writer(&path, &[FIRST]).unwrap();
     let particle = |frame: usize, k: usize| {
         [frame, k, frame * k, 1].map(|number| ((number * 7919) % 1_000_003) as f32)
     };
-    for frame in 0..FRAMES {
-        let particles: Vec<_> = (0..40).map(|k| particle(frame, k)).collect();
-        results.frames.push(3 + frame);
-        results.particles.push_frame(&particles).unwrap();
-        let outlines = results.scan_outlines.as_mut().unwrap();
-        outlines.push(&[[frame as i16, 1]]).unwrap();
-        writer.push(&results, frame).unwrap();
+    for row in 0..FRAMES {
+        macro_rules! push {
+            ($($name:ident),*) => {
+                $(growing.$name.as_mut().unwrap().push(all.$name.as_ref().unwrap()[row]);)*
+            };
+        }
+        columns!(push);
+        growing.frames.push(FIRST + row);
+        let outline = all.scan_outlines.as_ref().unwrap().row(row).unwrap();
+        let outlines = growing.scan_outlines.as_mut().unwrap();
+        outlines.push(&outline).unwrap();
+        let particles: Vec<_> = (0..40).map(|k| particle(row, k)).collect();
+        growing.particles.push_frame(&particles).unwrap();
+        all.particles.push_frame(&particles).unwrap();
+        writer.push(&growing, row).unwrap();
     }
-    // The unfinished file holds all but what the compressor buffers.
+    // The unfinished file holds all particles but what the compressor buffers.
     let length = || {
         let file = fs::read_dir(folder.path()).unwrap().next().unwrap();
         file.unwrap().metadata().unwrap().len()
     };
     let before = length();
-    writer.finish(&results).unwrap();
-    let (columns, outlines) = (8 * FRAMES as u64, 100 * FRAMES as u64);
+    writer.finish(&growing).unwrap();
+    // 68 numbers and three states of each frame.
+    let (columns, outlines) = ((68 * 8 + 3) * FRAMES as u64, 100 * FRAMES as u64);
     assert!(length() - before < columns + outlines + 1_000_000);
     assert!(before > 5_000_000, "{before}");
 
     let read = LocalizationResults::read(&path).unwrap();
-    assert_eq!(read, results);
+    assert_same(&read, &all);
     assert_eq!(
         read.particles.frame(FRAMES - 1).unwrap()[39],
         particle(FRAMES - 1, 39)
     );
     let at_once = folder.path().join("at_once.npz");
-    results.write(&at_once).unwrap();
+    all.write(&at_once).unwrap();
     assert!(fs::read(&path).unwrap() == fs::read(&at_once).unwrap());
 }
