@@ -18,6 +18,7 @@ use std::time::{Duration, Instant};
 
 use common::Recording;
 use fpmcl::internals::app::LocalizationResults;
+use fpmcl::localization::State;
 
 /// Time limit for a program that hangs.
 const TIMEOUT: Duration = Duration::from_secs(120);
@@ -424,6 +425,40 @@ fn a_busy_localization_ends_in_time_and_keeps_its_finished_frames() {
         assert_eq!(results.unwrap().frames.len(), 7);
         assert_eq!(temporary_files(&recording, "results"), [""; 0]);
     }
+}
+
+#[test]
+fn a_localization_that_is_interrupted_after_its_search_keeps_all_frames_as_the_filter_found_them() {
+    let recording = Recording::street(12);
+    recording.fpmcl("build-map").succeeds();
+    // The first frames are searching.
+    let late = [
+        "--set=tracking_loss.confirming_updates=3",
+        "--set=tracking_loss.sure_agreement=1",
+    ];
+    let results = || {
+        let results = LocalizationResults::read(&recording.path("results/localization.npz"));
+        results.unwrap()
+    };
+    let scan = PipedScan::new(&recording, 7);
+    let (code, stderr) = interrupted(&recording, &[LOCALIZE, &late].concat(), &scan);
+    assert_eq!(code, Some(130), "{stderr}");
+    let kept = results();
+    // The last of them may come too late.
+    assert!((7..=8).contains(&kept.len()), "{}", kept.len());
+    assert!(kept.trajectory_in_space.is_none());
+    let states = kept.states.unwrap();
+    let [first, last] = [states[0], states[6]].map(|state| state == State::Tracking as u8);
+    assert!(!first && last, "{states:?}");
+    // Without the interruption, they are filled back.
+    scan.restore();
+    let whole = late
+        .iter()
+        .fold(recording.fpmcl("localize"), |call, setting| {
+            call.with(setting)
+        });
+    whole.with("--force").succeeds();
+    assert!(results().trajectory_in_space.is_some());
 }
 
 #[test]

@@ -4,7 +4,6 @@ use anyhow::Result;
 
 use super::opened::Opened;
 use crate::app::report::LocalizationResults;
-use crate::app::run::Context;
 use crate::app::settings::OdometrySource;
 use crate::geometry::{Pose2, Pose3};
 use crate::localization::State;
@@ -17,7 +16,6 @@ pub fn fill_back(
     opened: &Opened,
     frames: &[Frame],
     searched: &LocalizationResults,
-    context: &Context,
 ) -> Result<Option<Vec<(usize, Pose3)>>> {
     let (Some(states), Some(estimates), Some(odometry), Some(sensor)) = (
         &searched.states,
@@ -28,7 +26,7 @@ pub fn fill_back(
         return Ok(None);
     };
     let config = &opened.config;
-    if config.motion.odometry == OdometrySource::None || context.interrupt.requested() {
+    if config.motion.odometry == OdometrySource::None {
         return Ok(None);
     }
     let states = states.iter();

@@ -88,8 +88,8 @@ pub struct LocalizeArgs {
     pub mcap: Option<FilePath>,
 }
 
-/// Largest number of frames whose trajectories are written, too, while a signal ends the process: that
-/// must not take long.
+/// Largest number of frames whose trajectories are written, too, after a signal: the end of the process must not take
+/// long.
 const MOST_FRAMES_AT_EXIT: usize = 50_000;
 
 /// Parses a start: x, y [m], heading [deg].
@@ -120,12 +120,14 @@ pub fn run_with(
     context.interrupt.supervise(
         || {
             localize(&opened, &mut motion, &recorded)?;
-            let searched = {
+            let searched = if context.interrupt.requested() {
+                None
+            } else {
                 let run = recorded();
                 (run.searched()).map(|searched| (searched, run.frames(&opened)))
             };
             let filled = searched
-                .map(|(searched, frames)| fill_back(&opened, &frames, &searched, context))
+                .map(|(searched, frames)| fill_back(&opened, &frames, &searched))
                 .transpose()?;
             let mut run = recorded();
             if let Some(filled) = filled.flatten() {
@@ -146,6 +148,9 @@ pub fn run_with(
         },
     )?;
     let mut run = run.into_inner().unwrap_or_else(PoisonError::into_inner);
+    if run.results.len() > MOST_FRAMES_AT_EXIT {
+        context.interrupt.check()?;
+    }
     write_trajectories(&opened, &run)?;
     let report = write_run(&opened, &mut run, context)?;
     run.finish(&opened)?;
