@@ -36,8 +36,8 @@ const LOCALIZE: &[&str] = &["localize", "localization.yml", "--backend=cpu"];
 const REFINE: &[&str] = &["refine", "refinement.yml", "--backend=cpu"];
 
 /// Signals of terminals, of service managers and batch systems, and of limits of time.
-const SIGNALS: [&str; 9] = [
-    "-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-ALRM", "-XCPU", "-VTALRM", "-PROF",
+const SIGNALS: [&str; 10] = [
+    "-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-USR2", "-ALRM", "-XCPU", "-VTALRM", "-PROF",
 ];
 
 /// A scan as a named pipe.
