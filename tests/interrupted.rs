@@ -17,7 +17,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use common::Recording;
+use fpmcl::geometry::{TriangleMesh, Vec3};
 use fpmcl::internals::app::LocalizationResults;
+use fpmcl::internals::ply;
 use fpmcl::localization::State;
 
 /// Time limit for a program that hangs.
@@ -409,6 +411,36 @@ fn a_long_ransac_ends_in_time() {
     thread::sleep(Duration::from_secs(1));
     assert!(child.try_wait().unwrap().is_none());
     stopped_in_time("-TERM", child);
+}
+
+#[test]
+fn a_search_for_the_ground_of_a_mesh_ends_in_time() {
+    let recording = Recording::street(2);
+    // A floor, and 100 km of narrow triangles, whose rows take seconds.
+    let mut mesh = TriangleMesh {
+        vertices: [[-30.0, -30.0], [30.0, -30.0], [30.0, 30.0], [-30.0, 30.0]]
+            .map(|[x, y]| Vec3::new(x, y, 0.0))
+            .into(),
+        triangles: vec![[0, 1, 2], [0, 2, 3]],
+        ..TriangleMesh::default()
+    };
+    for number in 0..150_000_u32 {
+        let (x, first) = (0.7 * number as f32 - 5e4, mesh.vertices.len() as u32);
+        let corners = [[x, -200.0], [x + 0.02, -200.0], [x, 200.0]];
+        let corners = corners.map(|[x, y]| Vec3::new(x, y, 0.0));
+        mesh.vertices.extend(corners);
+        mesh.triangles.push([first, first + 1, first + 2]);
+    }
+    ply::write(&recording.path("wide.ply"), &mesh, None).unwrap();
+    let mut child = start(
+        &recording,
+        &[LOCALIZE, &["--set=map_file=wide.ply"]].concat(),
+    );
+    let mut reader = stderr_of(&mut child);
+    // The last message before that.
+    read_until(&mut reader, Some("are the coordinates in"));
+    let stderr = stopped_in_time_with("-TERM", child, reader);
+    assert!(stderr.contains("no frame was finished"), "{stderr}");
 }
 
 #[test]
