@@ -253,7 +253,9 @@ pub struct TrajectoryRefiner {
     config: RefinerConfig,
     seed: u64,
     preparation: ScanPreparation,
+    /// The refined frames, without the first ones that were [forgotten](Self::forget).
     frames: Vec<FrameResult>,
+    forgotten: usize,
     /// Upright surfaces of the map around the last wide search.
     surfaces: RefCell<Option<NearbySurfaces>>,
     /// `refined * estimate⁻¹` of the last frame that was placed.
@@ -322,6 +324,7 @@ impl TrajectoryRefiner {
             config,
             seed,
             frames: Vec::new(),
+            forgotten: 0,
             surfaces: RefCell::default(),
             correction: None,
         })
@@ -341,7 +344,7 @@ impl TrajectoryRefiner {
         if self.frames.is_empty() {
             self.preparation.sensor.require_fit(scan)?;
         }
-        let mut rng = stream(self.seed, self.frames.len() as u64);
+        let mut rng = stream(self.seed, (self.forgotten + self.frames.len()) as u64);
         let image = self.preparation.range_image(scan, estimate.motion.as_ref());
         let previous = self.frames.last();
         let mut frame = FrameResult {
@@ -390,6 +393,14 @@ impl TrajectoryRefiner {
         }
         self.frames.push(frame);
         Ok(&self.frames[self.frames.len() - 1])
+    }
+
+    /// Forgets the frames before the last one, which those that follow do not need: a drive that is refined frame by frame
+    /// takes no more memory the longer it is.
+    pub(crate) fn forget(&mut self) {
+        let before = self.frames.len().saturating_sub(1);
+        self.frames.drain(..before);
+        self.forgotten += before;
     }
 
     /// Places frames before those that have poses in the map, from the last to the first, by the odometry into each
@@ -784,6 +795,33 @@ mod tests {
         let refined = places(Some(5));
         assert_eq!(refined.untracked, 1);
         assert!(off_m(&refined, 4) < 0.02 && off_m(&refined, 5) > 5.0);
+    }
+
+    #[test]
+    fn frames_that_are_forgotten_change_none_of_those_that_follow() {
+        let world = TestWorld::street();
+        let refine = |forgets: bool| {
+            let mut refiner =
+                TrajectoryRefiner::new(&world.map(), &sensor(), RefinerConfig::default(), 0)
+                    .unwrap();
+            let mut add = |row: u8| {
+                if forgets {
+                    refiner.forget();
+                }
+                let truth = world.pose_at(10.0 + f64::from(row), 0.0, 0.0);
+                let scan = Scan {
+                    points: world.scan(&truth).points,
+                    ..Scan::default()
+                };
+                let estimate = InitialEstimate::tracked(truth * Pose2::translation(0.05, 0.05));
+                refiner.add(&scan, &estimate).unwrap().clone()
+            };
+            let frames: Vec<FrameResult> = (0..4).map(&mut add).collect();
+            (frames, refiner.frames.len())
+        };
+        let ((all, kept), (same, fewer)) = (refine(false), refine(true));
+        assert_eq!((kept, fewer), (4, 2));
+        assert_eq!(all, same);
     }
 
     #[test]

@@ -105,7 +105,10 @@ impl<'a> FrameTracker<'a> {
         self.last = Some((row, frame.time_s));
         let runtime = started.elapsed();
         let refined = match &mut self.refiner {
-            Some(refiner) => Some(refiner.add(scan, &InitialEstimate::from(&estimate))?),
+            Some(refiner) => {
+                refiner.forget();
+                Some(refiner.add(scan, &InitialEstimate::from(&estimate))?)
+            }
             None => None,
         };
         Ok(TrackedFrame {
