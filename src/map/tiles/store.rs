@@ -14,7 +14,7 @@ use std::time::UNIX_EPOCH;
 
 use glam::{DVec3, Vec3};
 
-use super::contents::{CacheFile, CacheKind, PANORAMAS, files_of, is_in_use};
+use super::contents::{CacheKind, PANORAMAS, files_of, is_in_use};
 use super::file::{
     self, INDEX, INDEX_MAGIC, Source, TILE_MAGIC, TileEntry, TileFile, TileFileIndex, TileScene,
 };
@@ -208,7 +208,8 @@ impl TileStore {
     }
 
     /// Writes the tiles of a mesh into a folder, on the lattice of maps, and opens them. Files of older tiles that no
-    /// process uses are removed. In memory are the indices of the triangles, and one tile.
+    /// process uses are removed, and after an error, as on a full disk, those that were written. In memory are the indices
+    /// of the triangles, and one tile.
     ///
     /// The source is that of the file before the mesh was opened; `None` if the file has changed since.
     pub fn make(
@@ -219,54 +220,40 @@ impl TileStore {
         is_ground: &dyn Fn(usize) -> bool,
         own_path: Option<MappingPath>,
     ) -> io::Result<Option<Self>> {
-        let side_m = source.side_m;
         let stamp = source.stamp();
         require_own_index(folder)?;
         fs::create_dir_all(folder)?;
         // What replaces it while the tiles are made is not followed.
         let _claim = FolderClaim::new(folder)?;
         remove_abandoned(folder)?;
-        let mut triangles_of = triangles_of_tiles(mesh, side_m);
-        let ground_of = ground_of_tiles(mesh, is_ground, side_m);
-        for tile in ground_of.keys() {
-            triangles_of.entry(*tile).or_default();
-        }
-        let mut tiles = Vec::with_capacity(triangles_of.len());
-        for (tile, triangles) in &triangles_of {
-            let middle = DVec3::new(tile.column as f64, tile.row as f64, 0.0) * side_m;
-            let origin = origin_near(middle);
-            let part = part_on_lattice(mesh, triangles, origin);
-            let ground = ground_of.get(tile).map_or(&[][..], Vec::as_slice).iter();
-            let corners = ground.map(|&triangle| mesh.corners(triangle as usize).map(on_lattice));
-            let ends = [-0.5, 0.5].map(|side| middle + DVec3::splat(side * side_m));
-            let [first, last] = ends.map(|end| chunk_at(end, GROUND_CELL_M));
-            let chunks = chunks_of_triangles(corners, GROUND_CELL_M, window_of(first, last));
-            let chunks: Vec<(Cell, SharedBytes)> = (chunks.into_iter())
-                .filter(|(chunk, _)| tile_of_chunk(*chunk, side_m) == *tile)
-                .collect();
-            let of_part = |triangle: usize| is_ground(triangles[triangle] as usize);
-            let (bytes, bounds) = file::encode((*tile, stamp), &part, origin, &chunks, of_part);
-            if triangles.is_empty() && chunks.is_empty() {
-                continue;
+        let write = || {
+            let tiles = write_tiles(folder, &source, mesh, is_ground)?;
+            let has_given_path = source.has_given_path != 0;
+            if Self::source(mesh_file, has_given_path, source.side_m).ok() != Some(source) {
+                return Ok(None);
             }
-            let entry = TileEntry::new(*tile, bounds, triangles.len());
-            let file = entry.file(folder, stamp);
-            require_own(&file, Some(TILE_MAGIC))?;
-            write_atomically(&file, |out| out.write_all(&bytes))?;
-            tiles.push(entry);
-        }
-        let has_given_path = source.has_given_path != 0;
-        if Self::source(mesh_file, has_given_path, side_m).ok() != Some(source) {
-            return Ok(None);
-        }
-        let index = TileFileIndex {
-            source,
-            path: own_path,
-            tiles,
+            let index = TileFileIndex {
+                source,
+                path: own_path,
+                tiles,
+            };
+            require_own_index(folder)?;
+            write_atomically(&folder.join(INDEX), |out| out.write_all(&index.encode()))?;
+            io::Result::Ok(Some(index))
         };
-        require_own_index(folder)?;
-        write_atomically(&folder.join(INDEX), |out| out.write_all(&index.encode()))?;
-        remove_others(folder, stamp)?;
+        let written = write();
+        if !matches!(written, Ok(Some(_))) {
+            // The first error is the one to report.
+            let _ = remove_unless_in_use(folder, stamp, |kind, is_new| {
+                kind == CacheKind::Tile && is_new
+            });
+        }
+        let Some(index) = written? else {
+            return Ok(None);
+        };
+        remove_unless_in_use(folder, stamp, |kind, is_new| {
+            kind != CacheKind::Index && !is_new
+        })?;
         let (folder, in_use) = (folder.to_owned(), in_use(folder));
         Ok(Some(Self::over(folder, in_use, index, KEPT_BYTES)))
     }
@@ -491,6 +478,46 @@ impl ChunkSource for TileStore {
     }
 }
 
+/// Writes the tiles of a mesh into a folder.
+fn write_tiles(
+    folder: &Path,
+    source: &Source,
+    mesh: &dyn MeshView,
+    is_ground: &dyn Fn(usize) -> bool,
+) -> io::Result<Vec<TileEntry>> {
+    let (side_m, stamp) = (source.side_m, source.stamp());
+    let mut triangles_of = triangles_of_tiles(mesh, side_m);
+    let ground_of = ground_of_tiles(mesh, is_ground, side_m);
+    for tile in ground_of.keys() {
+        triangles_of.entry(*tile).or_default();
+    }
+    let mut tiles = Vec::with_capacity(triangles_of.len());
+    for (tile, triangles) in &triangles_of {
+        let middle = DVec3::new(tile.column as f64, tile.row as f64, 0.0) * side_m;
+        let origin = origin_near(middle);
+        let part = part_on_lattice(mesh, triangles, origin);
+        let ground = ground_of.get(tile).map_or(&[][..], Vec::as_slice).iter();
+        let corners = ground.map(|&triangle| mesh.corners(triangle as usize).map(on_lattice));
+        let ends = [-0.5, 0.5].map(|side| middle + DVec3::splat(side * side_m));
+        let [first, last] = ends.map(|end| chunk_at(end, GROUND_CELL_M));
+        let chunks = chunks_of_triangles(corners, GROUND_CELL_M, window_of(first, last));
+        let chunks: Vec<(Cell, SharedBytes)> = (chunks.into_iter())
+            .filter(|(chunk, _)| tile_of_chunk(*chunk, side_m) == *tile)
+            .collect();
+        let of_part = |triangle: usize| is_ground(triangles[triangle] as usize);
+        let (bytes, bounds) = file::encode((*tile, stamp), &part, origin, &chunks, of_part);
+        if triangles.is_empty() && chunks.is_empty() {
+            continue;
+        }
+        let entry = TileEntry::new(*tile, bounds, triangles.len());
+        let file = entry.file(folder, stamp);
+        require_own(&file, Some(TILE_MAGIC))?;
+        write_atomically(&file, |out| out.write_all(&bytes))?;
+        tiles.push(entry);
+    }
+    Ok(tiles)
+}
+
 /// The triangles of the ground that reach chunks of each tile.
 fn ground_of_tiles(
     mesh: &dyn MeshView,
@@ -574,18 +601,21 @@ fn in_use(folder: &Path) -> Option<UnlockedOnDrop> {
         .then_some(UnlockedOnDrop(opened))
 }
 
-/// Removes the tiles and panoramas with another stamp, unless a process may use them.
-fn remove_others(folder: &Path, stamp: u32) -> io::Result<()> {
+/// Removes files of a cache by what they are and whether they have a stamp, unless a process may use them.
+fn remove_unless_in_use(
+    folder: &Path,
+    stamp: u32,
+    is_removed: impl Fn(CacheKind, bool) -> bool,
+) -> io::Result<()> {
     if is_in_use(folder) {
         return Ok(());
     }
     let stamp = format!(".{stamp:08x}");
-    let is_other = |file: &CacheFile| {
+    for file in files_of(folder)? {
         let name = file.path.file_stem().unwrap_or_default();
-        file.kind != CacheKind::Index && !name.to_string_lossy().ends_with(&stamp)
-    };
-    for file in files_of(folder)?.iter().filter(|file| is_other(file)) {
-        fs::remove_file(&file.path)?;
+        if is_removed(file.kind, name.to_string_lossy().ends_with(&stamp)) {
+            fs::remove_file(&file.path)?;
+        }
     }
     Ok(())
 }
@@ -969,6 +999,22 @@ mod tests {
         fs::write(&index, b"nothing").unwrap();
         assert!(seen(&Map::load(&file, &options()).unwrap()) == expected);
         assert_eq!(fs::read(&index).unwrap(), b"nothing");
+    }
+
+    #[test]
+    fn tiles_that_were_written_before_an_error_are_removed() {
+        let (_folder, file) = saved();
+        let (tile, tiles) = (tile_at(&file, 600.0), folder_of(&file));
+        fs::remove_dir_all(&tiles).unwrap();
+        fs::create_dir(&tiles).unwrap();
+        // In the way of one of them, which is not the first.
+        fs::write(&tile, "my own").unwrap();
+        let map = Map::load(&file, &options()).unwrap();
+        assert_eq!(map.triangle_count(), 960);
+        let left = fs::read_dir(&tiles).unwrap();
+        let left: Vec<PathBuf> = left.map(|entry| entry.unwrap().path()).collect();
+        assert_eq!(left, std::slice::from_ref(&tile));
+        assert_eq!(fs::read(&tile).unwrap(), b"my own");
     }
 
     #[test]
