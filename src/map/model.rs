@@ -558,7 +558,15 @@ fn turned_from_y_up(mesh: &TriangleMesh) -> TriangleMesh {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+    use std::time::{Duration, SystemTime};
+
     use super::*;
+    use crate::geometry::Pose3;
+    use crate::lidar::LidarModel;
+    use crate::map::places::panorama::{PanoramaConfig, SearchRegion};
+    use crate::map::tiles::contents::{CacheKind, files_of};
+    use crate::rendering::Backend;
 
     /// A road of 100 m, 12 m wide, between walls of 6 m.
     fn street() -> TriangleMesh {
@@ -606,6 +614,62 @@ mod tests {
         let message = prepared(small).err().unwrap().to_string();
         assert!(message.starts_with("the map would need"), "{message}");
         prepared(MemoryBudget::default()).unwrap();
+    }
+
+    #[test]
+    fn of_the_panoramas_of_many_heights_the_least_recently_used_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("map.ply");
+        let path = MappingPath {
+            map_from_lidar: (10..90)
+                .map(|x| Pose3::translation(f64::from(x), 0.0, 2.0))
+                .collect(),
+            ..MappingPath::default()
+        };
+        ply::write(&file, &street(), Some(&path)).unwrap();
+        let options = MapOptions {
+            backend: Backend::Cpu,
+            cache: MapCache::NextToMap,
+            ..MapOptions::default()
+        };
+        let map = Map::load(&file, &options).unwrap();
+        let search_from = |sensor_height_m| {
+            let request = PanoramaRequest {
+                region: SearchRegion::Road,
+                lidar: LidarModel::default(),
+                sensor_height_m,
+                config: PanoramaConfig {
+                    cell_m: 5.0,
+                    ..PanoramaConfig::default()
+                },
+            };
+            map.panoramas(&request).unwrap();
+        };
+        let kept = || -> Vec<PathBuf> {
+            let files = files_of(&options.cache.folder_of(&file).unwrap()).unwrap();
+            let panoramas = files
+                .into_iter()
+                .filter(|it| it.kind == CacheKind::Panoramas);
+            panoramas.map(|it| it.path).collect()
+        };
+        // Sparse files of 40 MiB, two of which are too large together.
+        let age = |panoramas: &Path, hours: u64| {
+            let file = File::options().write(true).open(panoramas).unwrap();
+            file.set_len(40 << 20).unwrap();
+            let used = SystemTime::now() - Duration::from_secs(3600 * hours);
+            file.set_modified(used).unwrap();
+        };
+        search_from(1.5);
+        let first = kept().remove(0);
+        age(&first, 3);
+        search_from(2.0);
+        let second = kept().into_iter().find(|it| *it != first).unwrap();
+        age(&second, 2);
+        search_from(1.5);
+        search_from(2.5);
+        let left = kept();
+        assert_eq!(left.len(), 2);
+        assert!(left.contains(&first) && !left.contains(&second));
     }
 
     #[test]
