@@ -15,6 +15,7 @@ use super::results::ComparisonResults;
 use super::{cases, keys, page, tables};
 use crate::app::comparison::config::ComparisonConfig;
 use crate::app::comparison::table::Table;
+use crate::app::run::visible::visible;
 use crate::app::run::{Context, Outputs, Printed, output, version};
 
 /// Page of the sequences that are described as hard cases.
@@ -135,9 +136,9 @@ fn table_file(table: &Table) -> String {
 
 fn write_tables(tables: &[Table], folder: &Path) -> Result<()> {
     let all: Vec<String> = tables.iter().map(text::table).collect();
-    output::write_text(&folder.join("tables.txt"), &all.join("\n"))?;
+    output::write_text(&folder.join("tables.txt"), &visible(&all.join("\n")))?;
     let all: Vec<String> = tables.iter().map(markdown::table).collect();
-    output::write_text(&folder.join("tables.md"), &all.join("\n"))?;
+    output::write_text(&folder.join("tables.md"), &visible(&all.join("\n")))?;
     for table in tables {
         let path = folder.join(table_file(table));
         output::write_file(&path, |file| csv::write(table, file))?;

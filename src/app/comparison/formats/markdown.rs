@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::app::comparison::table::{Cell, Table, value_and_uncertainty};
+use crate::app::run::visible::visible_in_line;
 
 /// Formats the table under a heading.
 pub fn table(table: &Table) -> String {
@@ -45,9 +46,9 @@ fn cell(cell: &Cell) -> String {
     }
 }
 
-/// Escapes the bar, which would end the cell.
+/// Shows control characters, and escapes the bar, which would end the cell.
 fn escape(text: &str) -> String {
-    text.replace('|', "\\|")
+    visible_in_line(text).replace('|', "\\|")
 }
 
 #[cfg(test)]
@@ -70,5 +71,13 @@ mod tests {
         );
         assert!(lines[3].contains("[B\\|C](runs/b.html)"), "{text}");
         assert_eq!(text.matches("- **").count(), 2);
+    }
+
+    #[test]
+    fn control_characters_of_a_cell_are_shown() {
+        let mut example = example();
+        example.rows[0][0] = "a\u{1b}[2J\n| b".into();
+        let text = table(&example);
+        assert!(text.contains(r"| a\u001b[2J\n\| b |"), "{text}");
     }
 }
