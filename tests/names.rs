@@ -34,12 +34,18 @@ fn named() -> Recording {
 }
 
 fn localize(recording: &Recording, name: &[u8]) -> Fpmcl {
-    let named = |end: &str| OsString::from_vec([name, end.as_bytes()].concat());
     let call = fpmcl("localize").in_folder(recording.folder());
-    let call = call.with(named("")).with("--map").with(named(".ply"));
+    in_map(call.with(OsStr::from_bytes(name)), name, ".out")
+}
+
+/// A call of `localize` or `live` with the map, the true poses and the output of a name.
+fn in_map(call: Fpmcl, name: &[u8], output: &str) -> Fpmcl {
+    let named = |end: &str| OsString::from_vec([name, end.as_bytes()].concat());
+    let result = Path::new(&named(output)).join("localization.npz");
+    let call = call.with("--map").with(named(".ply"));
     let call = call.with("--truth").with(named(".txt"));
     let call = call.with("--calib").with("calib.txt");
-    let call = call.with("--output").with(named(".out/localization.npz"));
+    let call = call.with("--output").with(result);
     [
         ("pose_tracking", "True"),
         ("odometry", "ground_truth"),
@@ -198,6 +204,22 @@ fn names_that_are_no_text_are_read_and_written_as_their_bytes() {
         odometry.succeeds();
         call("info").with(named("")).succeeds();
         call("info").with(named(".ply")).succeeds();
+        let live = call("live").with("--replay").with(named(""));
+        let live = live.with("--rate=1000").with("--queue=100");
+        in_map(live, mark, ".live").may_be_refused().succeeds();
+        let export = call("export").with(&result);
+        export.with("--mcap").with(named(".mcap")).succeeds();
+        let export = call("export").with(named(".ply"));
+        export.with("--glb").with(named(".glb")).succeeds();
+        let ground = call("ground").with(named("")).set("plot_step", "0");
+        ground.set("output_folder", "ground").succeeds();
+        let simulation = recording.folder().join(named(".yml"));
+        let keys = "output_folder: street\nn_scans: 1\nscanner: {azimuth_steps: 100}\n";
+        fs::write(simulation, keys).unwrap();
+        call("simulate").with(named(".yml")).succeeds();
+        for written in ["ground", "street"] {
+            fs::remove_dir_all(recording.path(written)).unwrap();
+        }
         let map = call("build-map")
             .with(named(""))
             .with("--output")

@@ -65,6 +65,12 @@ impl Fpmcl {
         self
     }
 
+    /// Takes a result of which less than half is localized for a success.
+    pub fn may_be_refused(mut self) -> Self {
+        self.may_be_refused = true;
+        self
+    }
+
     /// Runs the binary and expects success.
     #[track_caller]
     pub fn succeeds(self) -> Output {
@@ -339,10 +345,10 @@ impl Recording {
             "build-map" => call.with("build_map.yml"),
             "localize" => call.with("localization.yml").with("--backend=cpu"),
             // Maps of few scans have no ground below the car, where nothing can be refined.
-            "refine" => Fpmcl {
-                may_be_refused: true,
-                ..call.with("refinement.yml").with("--backend=cpu")
-            },
+            "refine" => {
+                let call = call.with("refinement.yml").with("--backend=cpu");
+                call.may_be_refused()
+            }
             other => panic!("no configuration for {other}"),
         }
     }
