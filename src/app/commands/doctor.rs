@@ -12,7 +12,6 @@ use nalgebra::Vector3;
 use schemars::JsonSchema;
 use serde::Serialize;
 
-use crate::app::run::memory;
 use crate::app::run::{Context, Printed, version};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::lidar::{Beam, LidarModel, RangeImage};
@@ -234,7 +233,9 @@ struct Workload {
 
 impl Workload {
     fn new() -> Result<Self> {
-        let simulation = Simulation::new(&SimulationConfig::default(), None, memory::budget())?;
+        // Its size does not depend on anything that could be set.
+        let budget = MemoryBudget::default();
+        let simulation = Simulation::new(&SimulationConfig::default(), None, budget)?;
         let mut street = simulation.street.surface.mesh.clone();
         street.snap();
         let tiles = grid::cut(&street, TileConfig::default().side_m);
