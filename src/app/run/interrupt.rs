@@ -1,5 +1,5 @@
 //! Ctrl-C and every other signal that asks a process to end: the first stops a command at the next point
-//! without loss, at the latest after a second and a half; the second exits at once.
+//! without loss, at the latest after `GRACE`; the second exits at once.
 //!
 //! Loops poll [`Interrupt::requested`]. For what lasts longer, the process ends while it runs: files
 //! are written atomically, so what is finished stays. A command whose finished work is still in memory
