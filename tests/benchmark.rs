@@ -8,6 +8,7 @@ use std::fs;
 use std::path::Path;
 
 use common::{Fpmcl, fpmcl, json, simulate_two_drives};
+use nalgebra::{Isometry3, Matrix4, Unit, Vector3};
 
 const STREET: &str = "\
 output_folder: street
@@ -43,6 +44,8 @@ fn two_sessions_give_all_figures_and_a_second_run_takes_what_is_finished() {
         let rmse = format!("/localization/{trajectory}/metrics/position_m/rmse");
         assert!(number(&rmse) < 0.1);
     }
+    // The truths of both drives are in one frame, in which nothing is to be aligned.
+    assert!(number("/localization_aligned/refined/metrics/position_m/rmse") < 0.1);
     assert_eq!(report["layout"], "KITTI odometry");
     assert!(report["machine"]["processor"].is_string());
     let page = fs::read_to_string(folder.join("results/benchmark/benchmark.html")).unwrap();
@@ -91,7 +94,46 @@ fn one_session_without_a_truth_is_divided_and_says_that_it_has_no_errors() {
     assert!(report["odometry"]["scan_by_scan"].is_null());
     assert!(report["localization"]["mcl"].is_null());
     assert_eq!(report["localization"]["localized"], true);
-    assert!(report["second"].is_null());
+    assert!(report["second"].is_null() && report["localization_aligned"].is_null());
+}
+
+#[test]
+fn a_truth_of_the_second_session_in_another_frame_is_compared_after_alignment() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    // Around a bend: a straight path determines no rotation about itself.
+    let bend = "path: [{length_m: 45, turn_deg: 60, grade_percent: 3}]";
+    simulate_two_drives(folder, &format!("{STREET}{bend}\n"));
+    // A turn about an inclined axis, and a shift of 50 m.
+    let axis = Unit::new_normalize(Vector3::new(0.1, -1.0, 0.2));
+    let other_from_world = Isometry3::new([30.0, 4.0, -40.0].into(), axis.into_inner() * 0.8);
+    let other_from_world = other_from_world.to_homogeneous();
+    let poses = folder.join("street/drive_2/poses.txt");
+    let moved = |row: &str| {
+        let numbers = row.split_whitespace().map(|it| it.parse::<f64>().unwrap());
+        let last = [0.0, 0.0, 0.0, 1.0];
+        let world_from_cam0 = Matrix4::from_row_iterator(numbers.chain(last));
+        let other_from_cam0 = other_from_world * world_from_cam0;
+        let numbers = (0..12).map(|i| format!("{:e}", other_from_cam0[(i / 4, i % 4)]));
+        numbers.collect::<Vec<_>>().join(" ") + "\n"
+    };
+    let truth = fs::read_to_string(&poses).unwrap();
+    fs::write(&poses, truth.lines().map(moved).collect::<String>()).unwrap();
+    let printed = benchmark(folder).succeeds().stdout;
+    assert!(printed.contains("refined, aligned"), "{printed}");
+    let report = json(&folder.join("results/benchmark/benchmark.json"));
+    let rmse_m = |which: &str, trajectory: &str| {
+        let metrics = &report[which][trajectory]["metrics"];
+        metrics["position_m"]["rmse"].as_f64().unwrap()
+    };
+    for trajectory in ["mcl", "refined"] {
+        assert!(rmse_m("localization", trajectory) > 5.0);
+        assert!(rmse_m("localization_aligned", trajectory) < 0.1);
+        let errors = &report["localization_aligned"][trajectory]["metrics"];
+        assert!(errors["heading_rad"]["rmse"].as_f64().unwrap() < 0.02);
+    }
+    let page = fs::read_to_string(folder.join("results/benchmark/benchmark.html")).unwrap();
+    assert!(page.contains("after a rigid alignment of the path"));
 }
 
 #[test]

@@ -30,6 +30,9 @@ pub struct BenchmarkReport {
     pub map: MapFigures,
     /// The localization.
     pub localization: Report,
+    /// Its errors after a rigid alignment of the path with the true poses, for truths of the two sessions that are not in one
+    /// frame; `null` without a second session, and without true poses of it.
+    pub localization_aligned: Option<Report>,
 }
 
 /// Figures of the odometry.
@@ -82,11 +85,20 @@ impl BenchmarkReport {
                 (name, format!("{percent:.2} %, {turn:.2} deg/100 m"))
             }));
         }
+        let aligned = self.localization_aligned.as_ref();
         for (name, report) in [
-            ("localization", &self.localization.mcl),
-            ("refined", &self.localization.refined),
+            ("localization", self.localization.mcl.as_ref()),
+            ("refined", self.localization.refined.as_ref()),
+            (
+                "localization, aligned",
+                aligned.and_then(|it| it.mcl.as_ref()),
+            ),
+            (
+                "refined, aligned",
+                aligned.and_then(|it| it.refined.as_ref()),
+            ),
         ] {
-            rows.extend(report.as_ref().map(|report| {
+            rows.extend(report.map(|report| {
                 let position = length(report.metrics.position_m.rmse);
                 let heading_deg = report.metrics.heading_rad.rmse.to_degrees();
                 (name, format!("{position}, {heading_deg:.3} deg"))

@@ -169,6 +169,8 @@ pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
     let located = second.as_ref().unwrap_or(&first);
     let localization = benchmark.localization(located, second.is_some(), &map.folder)?;
     time("3 localization", &localization);
+    let aligned = localization.folder.join(ALIGNED).join("report.json");
+    let localized = Report::read_json(&localization.folder.join("report.json"))?;
     let report = BenchmarkReport {
         layout: first.layout.name().to_owned(),
         recording: args.recording.clone(),
@@ -178,7 +180,10 @@ pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
         stage_seconds,
         odometry: read_json(&odometry.folder.join(FIGURES))?,
         map: read_json(&map.folder.join(MAP_REPORT))?,
-        localization: Report::read_json(&localization.folder.join("report.json"))?,
+        localization: localized,
+        localization_aligned: (aligned.exists())
+            .then(|| Report::read_json(&aligned))
+            .transpose()?,
     };
     claims.begin(&main)?;
     let files = RunFiles::new(&localization.folder.join(RESULT));
@@ -197,6 +202,7 @@ const FIGURES: &str = "figures.json";
 const MAP: &str = "map.ply";
 const MAP_REPORT: &str = "map.report.json";
 const RESULT: &str = "localization.npz";
+const ALIGNED: &str = "aligned_evaluation";
 
 /// The stages.
 struct Benchmark<'a> {
@@ -208,7 +214,9 @@ impl Benchmark<'_> {
     /// Finds the poses of a session by its scans, and their errors.
     fn odometry(&self, session: &Session) -> Result<SharedResult> {
         let config: OdometryCommandConfig = self.configured(session.keys(None, false))?;
-        self.stage("odometry", &config, &session.content, |folder| {
+        let evaluation: EvaluationConfig = self.configured(session.evaluation_keys())?;
+        let configs = (&config, &evaluation);
+        self.stage("odometry", &configs, &session.content, |folder| {
             let config = OdometryCommandConfig {
                 output_folder: folder.into(),
                 ..config.clone()
@@ -219,16 +227,11 @@ impl Benchmark<'_> {
                 if session.truth.is_none() {
                     return Ok(None);
                 }
-                let evaluated = folder.join(format!("{name}_evaluation"));
-                let keys = [
-                    (
-                        "result_file",
-                        path_value(&folder.join(format!("{name}_tum.txt"))),
-                    ),
-                    ("output_folder", path_value(&evaluated)),
-                ];
-                let keys = keys.into_iter().chain(session.evaluation_keys());
-                let config: EvaluationConfig = self.configured(keys.collect())?;
+                let config = EvaluationConfig {
+                    result_file: folder.join(format!("{name}_tum.txt")).into(),
+                    output_folder: Some(folder.join(format!("{name}_evaluation")).into()),
+                    ..evaluation.clone()
+                };
                 let report = evaluate::run(&config, self.context);
                 let report = report.with_context(|| format!("while evaluating {name}"))?;
                 Ok(Some(Box::new(report)))
@@ -257,13 +260,20 @@ impl Benchmark<'_> {
         })
     }
 
-    /// Localizes a session, or every other scan of it, in a map, and refines it.
+    /// Localizes a session, or every other scan of it, in a map, and refines it. The truth of another session than that of the
+    /// map may be in another frame, so that the errors are those after a rigid alignment, too.
     fn localization(&self, session: &Session, is_whole: bool, map: &Path) -> Result<SharedResult> {
         let mut keys = session.keys(Some(1), is_whole);
         keys.extend(session.truth_keys());
         keys.push(("map_input.map_file", path_value(&map.join(MAP))));
         let config: LocalizationConfig = self.configured(keys)?;
-        self.stage("localization", &config, &session.content, |folder| {
+        let keys = [
+            ("alignment", json!("rigid")),
+            ("output.plots", json!(false)),
+        ];
+        let evaluation: EvaluationConfig = self.configured(keys.into())?;
+        let configs = (&config, &evaluation);
+        self.stage("localization", &configs, &session.content, |folder| {
             let config = LocalizationConfig {
                 result_path: folder.join(RESULT).into(),
                 ..config.clone()
@@ -271,7 +281,19 @@ impl Benchmark<'_> {
             localize::run(&config, self.context).context("while localizing")?;
             let refinement = refine::base_config(Some(&config.result_path));
             let refined = refine::run(&refinement, self.context);
-            refined.context("while refining").map(drop)
+            let refined = refined.context("while refining")?;
+            if is_whole && (refined.mcl.is_some() || refined.refined.is_some()) {
+                let evaluation = EvaluationConfig {
+                    result_file: config.result_path.clone(),
+                    output_folder: Some(folder.join(ALIGNED).into()),
+                    ..evaluation.clone()
+                };
+                // Too few trusted poses determine no alignment.
+                if let Err(error) = evaluate::run(&evaluation, self.context) {
+                    tracing::warn!("there are no errors after a rigid alignment: {error:#}");
+                }
+            }
+            Ok(())
         })
     }
 

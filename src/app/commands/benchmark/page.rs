@@ -42,6 +42,13 @@ pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Resul
     ])];
     of_map.extend(picture(map, "The map from above")?);
     let mut of_localization = numbers(&report.localization);
+    if let Some(aligned) = &report.localization_aligned {
+        of_localization.push(PageElement::Paragraph(
+            "The same after a rigid alignment of the path with the true poses: what counts where the truths of the two sessions are not in one frame."
+                .to_owned(),
+        ));
+        of_localization.extend(numbers(aligned));
+    }
     let plots = localized.file("plots");
     for (_, name, caption) in [("", "path.png", "Path"), PICTURES[0], PICTURES[2]] {
         of_localization.extend(picture(&plots.join(name), caption)?);
