@@ -47,7 +47,8 @@ fn two_sessions_give_all_figures_and_a_second_run_takes_what_is_finished() {
     // The truths of both drives are in one frame, in which nothing is to be aligned.
     assert!(number("/localization_aligned/refined/metrics/position_m/rmse") < 0.1);
     assert_eq!(report["layout"], "KITTI odometry");
-    assert!(report["machine"]["processor"].is_string());
+    let machine = |name: &str| report["machine"][name].as_str().unwrap();
+    assert_eq!(report["published"][0]["method"], "GroundLoc");
     let page = fs::read_to_string(folder.join("results/benchmark/benchmark.html")).unwrap();
     for part in [
         "Odometry",
@@ -55,6 +56,14 @@ fn two_sessions_give_all_figures_and_a_second_run_takes_what_is_finished() {
         "Published figures",
         "GroundLoc",
         "0.134 m",
+        "0.205 degrees",
+        "Definitions",
+        "root mean square of the distance",
+        "Program and machine",
+        report["program"].as_str().unwrap(),
+        machine("processor"),
+        machine("memory"),
+        machine("renderer"),
     ] {
         assert!(page.contains(part), "{part}");
     }

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::published::Published;
 use crate::app::report::Report;
 use crate::app::report::results::length;
 use crate::file_path::FilePath;
@@ -20,7 +21,7 @@ pub struct BenchmarkReport {
     pub second: Option<FilePath>,
     /// Name, version and hash of the program.
     pub program: String,
-    /// The machine.
+    /// The machine: processor, threads, memory, system and renderer.
     pub machine: BTreeMap<String, String>,
     /// Wall time of each stage [s].
     pub stage_seconds: BTreeMap<String, f64>,
@@ -33,6 +34,8 @@ pub struct BenchmarkReport {
     /// Its errors after a rigid alignment of the path with the true poses, for truths of the two sessions that are not in one
     /// frame; `null` without a second session, and without true poses of it.
     pub localization_aligned: Option<Report>,
+    /// Figures that others have published, for orientation.
+    pub published: Vec<Published>,
 }
 
 /// Figures of the odometry.

@@ -171,12 +171,15 @@ pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
     time("3 localization", &localization);
     let aligned = localization.folder.join(ALIGNED).join("report.json");
     let localized = Report::read_json(&localization.folder.join("report.json"))?;
+    let mut machine = machine::properties(context.threads);
+    let renderer = localized.about.get("renderer");
+    machine.extend(renderer.map(|name| ("renderer".to_owned(), name.clone())));
     let report = BenchmarkReport {
         layout: first.layout.name().to_owned(),
         recording: args.recording.clone(),
         second: args.second.clone(),
         program: version::program()?,
-        machine: machine::properties(context.threads),
+        machine,
         stage_seconds,
         odometry: read_json(&odometry.folder.join(FIGURES))?,
         map: read_json(&map.folder.join(MAP_REPORT))?,
@@ -184,6 +187,7 @@ pub fn run(args: &BenchmarkArgs, context: &Context) -> Result<Printed> {
         localization_aligned: (aligned.exists())
             .then(|| Report::read_json(&aligned))
             .transpose()?,
+        published: published::PUBLISHED.to_vec(),
     };
     claims.begin(&main)?;
     let files = RunFiles::new(&localization.folder.join(RESULT));

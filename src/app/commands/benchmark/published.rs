@@ -1,12 +1,20 @@
 //! Figures that others have published about public sequences.
 
+use schemars::JsonSchema;
+use serde::Serialize;
+
 /// A published figure.
+#[derive(Clone, Copy, Debug, Serialize, JsonSchema)]
 pub struct Published {
+    /// The method.
     pub method: &'static str,
+    /// The sequences.
     pub data: &'static str,
+    /// The figure, with its unit.
     pub figure: &'static str,
     /// What it is of.
     pub quantity: &'static str,
+    /// Where it was published.
     pub source: &'static str,
 }
 
@@ -45,6 +53,6 @@ pub const PUBLISHED: [Published; 5] = [
         data: "-",
         figure: "none",
         quantity: "it makes maps and closes loops; it does not localize in a map, and none of its figures is taken here",
-        source: "Guadagnino et al., KISS-SLAM (2025)",
+        source: "Guadagnino et al., KISS-SLAM (2025), arXiv 2503.12660",
     },
 ];
