@@ -4,9 +4,19 @@
 
 mod common;
 
+#[cfg(unix)]
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
+#[cfg(unix)]
+use std::process::{Child, Command, Stdio};
+#[cfg(unix)]
+use std::thread;
+#[cfg(unix)]
+use std::time::{Duration, Instant};
 
+#[cfg(unix)]
+use common::replace_by_pipe;
 use common::{Fpmcl, fpmcl, json, simulate_two_drives};
 use nalgebra::{Isometry3, Matrix4, Unit, Vector3};
 
@@ -171,6 +181,77 @@ fn scans_and_truths_that_have_changed_are_measured_again() {
     fs::write(&poses, format!("{rows} {last_m}\n")).unwrap();
     benchmark(folder).succeeds();
     assert_ne!(stages.map(seconds)[0], before[0]);
+}
+
+/// The time of each stage that a benchmark has finished, by its name.
+#[cfg(unix)]
+fn finished_stages(folder: &Path) -> BTreeMap<String, serde_json::Value> {
+    let stages = fs::read_dir(folder.join("results/benchmark/stages"));
+    let paths = stages.into_iter().flatten().map(|it| it.unwrap().path());
+    let finished = paths.filter_map(|path| {
+        let text = fs::read_to_string(path.join("finished.json")).ok()?;
+        let mark: serde_json::Value = serde_json::from_str(&text).ok()?;
+        let name = path.file_name()?.to_str()?.split_once('-')?.0.to_owned();
+        Some((name, mark["seconds"].clone()))
+    });
+    finished.collect()
+}
+
+#[cfg(unix)]
+#[test]
+fn a_benchmark_that_is_ended_between_its_stages_resumes() {
+    /// Time limit for a program that hangs.
+    const TIMEOUT: Duration = Duration::from_secs(300);
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, STREET);
+    // The program waits for this scan twice: where it opens the sessions, and in the third stage.
+    let scan = folder.join("street/drive_2/velodyne/000020.bin");
+    let bytes = replace_by_pipe(&scan);
+    let mut child = Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"))
+        .args(["benchmark", "kitti", "street/drive_1"])
+        .args(["--second", "street/drive_2", "--quiet"])
+        .current_dir(folder)
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let (pipe, content) = (scan.clone(), bytes.clone());
+    thread::spawn(move || fs::write(pipe, content));
+    let mut wait_until = |is_reached: &dyn Fn(&mut Child) -> bool| {
+        let begin = Instant::now();
+        while !is_reached(&mut child) {
+            if begin.elapsed() > TIMEOUT {
+                child.kill().unwrap();
+                panic!("the program hangs: {:?}", finished_stages(folder));
+            }
+            thread::sleep(Duration::from_millis(20));
+        }
+    };
+    wait_until(&|child| {
+        let is_running = child.try_wait().unwrap().is_none();
+        assert!(is_running, "{:?}", finished_stages(folder));
+        finished_stages(folder).len() == 2
+    });
+    wait_until(&|child| {
+        let id = child.id().to_string();
+        // After the first one, there is nothing to be ended any more.
+        let _sent = Command::new("kill").args(["-TERM", &id]).status().unwrap();
+        let status = child.try_wait().unwrap();
+        assert!(status.is_none_or(|status| !status.success()));
+        status.is_some()
+    });
+    let before = finished_stages(folder);
+    assert_eq!(before.keys().collect::<Vec<_>>(), ["map", "odometry"]);
+    let report = folder.join("results/benchmark/benchmark.json");
+    assert!(!report.exists());
+
+    fs::remove_file(&scan).unwrap();
+    fs::write(&scan, bytes).unwrap();
+    benchmark(folder).succeeds();
+    let report = json(&report);
+    assert_eq!(report["stage_seconds"]["1 odometry"], before["odometry"]);
+    assert_eq!(report["stage_seconds"]["2 map"], before["map"]);
 }
 
 #[test]
