@@ -9,19 +9,22 @@ mod bag_writers;
 #[path = "../src/skips_for_tests.rs"]
 mod skips;
 
+use std::f64::consts::{FRAC_1_SQRT_2, FRAC_PI_2};
 use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
 use assert_cmd::Command;
 use fpmcl::geometry::{Pose3, Vec3};
+use fpmcl::inertial::GRAVITY_M_S2;
 use fpmcl::internals::scan_files;
 use fpmcl::lidar::Scan;
 use fpmcl::recording::{Bag, FramePose, PoseTrack, RecordingError, TopicKind};
+use nalgebra::{UnitQuaternion, Vector3};
 use rayon::prelude::*;
 
 use bag_writers::{
-    Cloud, Kind, Recorded, compress, db3, livox, mcap, mcap_compressed, nav_sat_fix, odometry,
+    Cloud, Kind, Recorded, compress, db3, imu, livox, mcap, mcap_compressed, nav_sat_fix, odometry,
     point_cloud2, pose_stamped, ros1, transforms,
 };
 
@@ -273,6 +276,61 @@ fn positions_of_a_receiver_are_the_same_in_every_serialization() {
     assert_eq!(expected.antenna_m, Some([0.0, 0.0, -1.0]));
     assert_eq!(fixes(Kind::CdrBig), expected);
     assert_eq!(fixes(Kind::Ros1), expected);
+}
+
+#[test]
+fn inertial_measurements_are_the_same_in_every_serialization() {
+    let folder = tempfile::tempdir().unwrap();
+    let rates = |number: u32| [0.1 * f64::from(number), -0.2, 0.3];
+    let forces = [0.6, -0.8, 9.7];
+    let measured = |kind, per_m_s2: f64| {
+        let mut messages = recording(kind);
+        // A quarter of a turn about z; the lidar has half a turn.
+        let quarter = [0.0, 0.0, 0.0, 0.0, 0.0, FRAC_1_SQRT_2, FRAC_1_SQRT_2];
+        messages.push(Recorded {
+            topic: "/tf_static",
+            message_type: "tf2_msgs/msg/TFMessage",
+            time_ns: START_NS,
+            data: transforms(kind, &[("base_link", "imu_link", quarter)]),
+        });
+        for number in 0..30_u32 {
+            let time_ns = START_NS + 10_000_000 * u64::from(number);
+            // The fourth one has no stamp.
+            let stamp_ns = if number == 3 { 0 } else { time_ns };
+            let forces = forces.map(|force| force * per_m_s2);
+            messages.push(Recorded {
+                topic: "/imu",
+                message_type: "sensor_msgs/msg/Imu",
+                time_ns: time_ns + 2_000_000,
+                data: imu(kind, stamp_ns, "/imu_link", &rates(number), &forces),
+            });
+        }
+        let path = folder.path().join("imu.mcap");
+        let serialization = if kind == Kind::Ros1 { "ros1" } else { "cdr" };
+        let options = mcap::WriteOptions::new().compression(None);
+        fs::write(&path, mcap(options, serialization, &messages)).unwrap();
+        let recording = fpmcl::recording::Recording::open(&path).unwrap();
+        recording.read_imu(Path::new("/imu"), None).unwrap()
+    };
+    let expected = measured(Kind::CdrLittle, 1.0);
+    assert_eq!(expected.samples.rows().len(), 30);
+    for (number, sample) in (0..).zip(expected.samples.rows()) {
+        let logged_later_s = if number == 3 { 0.002 } else { 0.0 };
+        let time_s = 1e-9 * START_NS as f64 + 0.01 * f64::from(number) + logged_later_s;
+        assert!((sample.time_s - time_s).abs() < 1e-6, "{number}");
+        assert_eq!(sample.rate_rad_s, Vector3::from(rates(number)));
+        assert_eq!(sample.force_m_s2, Vector3::from(forces));
+    }
+    let lidar_from_imu = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -FRAC_PI_2);
+    let found = expected.lidar_from_imu.unwrap();
+    assert!(found.angle_to(&lidar_from_imu) < 1e-6, "{found}");
+    assert_eq!(measured(Kind::CdrBig, 1.0), expected);
+    assert_eq!(measured(Kind::Ros1, 1.0), expected);
+    // The drivers of Livox write forces in g.
+    let in_g = measured(Kind::Ros1, 1.0 / GRAVITY_M_S2);
+    for (found, expected) in in_g.samples.rows().iter().zip(expected.samples.rows()) {
+        assert!((found.force_m_s2 - expected.force_m_s2).norm() < 1e-9);
+    }
 }
 
 #[test]

@@ -192,6 +192,16 @@ pub fn nav_sat_fix(
     to.bytes
 }
 
+/// `sensor_msgs/Imu` with angular rates [rad/s] and forces; orientation and covariances are numbers that are neither.
+pub fn imu(kind: Kind, stamp_ns: u64, frame: &str, rates: &[f64; 3], forces: &[f64; 3]) -> Vec<u8> {
+    let mut to = Serializer::new(kind);
+    to.header(stamp_ns, frame).numbers(&[0.1, 0.2, 0.3, 0.9]);
+    to.numbers(&[11.0; 9]).numbers(rates);
+    to.numbers(&[12.0; 9]).numbers(forces);
+    to.numbers(&[13.0; 9]);
+    to.bytes
+}
+
 /// `geometry_msgs/PoseStamped`.
 pub fn pose_stamped(kind: Kind, stamp_ns: u64, frame: &str, pose: &[f64; 7]) -> Vec<u8> {
     let mut to = Serializer::new(kind);
