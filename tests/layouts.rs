@@ -805,6 +805,64 @@ fn measurements_are_given_by_the_folder_of_kitti() {
 }
 
 #[test]
+fn the_folder_of_kitti_has_the_rates_forces_and_positions_that_were_written() {
+    const ROWS: usize = 25;
+    let set = kitti_raw();
+    let oxts = format!("{}/oxts", set.path);
+    // Each number shows its column and its row.
+    let number = |column: usize, row: usize| column as f64 + 0.001 * row as f64;
+    let mut times = String::new();
+    for row in 0..ROWS {
+        let numbers: Vec<String> = (0..30)
+            .map(|column| match (column, row) {
+                (0, _) => format!("{}", 49.0 + 1e-5 * row as f64),
+                // The accuracy of one position is not known.
+                (23, 1) => "0".to_owned(),
+                _ => format!("{}", number(column, row)),
+            })
+            .collect();
+        set.write(&format!("{oxts}/data/{row:010}.txt"), numbers.join(" "));
+        let (second, tenth) = (40 + row / 10, row % 10);
+        writeln!(times, "2020-09-13 12:26:{second}.{tenth}00000000").unwrap();
+    }
+    set.write(&format!("{oxts}/timestamps.txt"), times);
+    let recording = set.open(None).unwrap();
+    let oxts = set.folder.path().join(&oxts);
+
+    let imu = recording.read_imu(&oxts, None).unwrap();
+    let fixes = recording.read_fixes(&oxts).unwrap();
+    assert_eq!((imu.samples.rows().len(), fixes.fixes.len()), (ROWS, ROWS));
+    for row in 0..ROWS {
+        let time_s = START_S as f64 + 0.1 * row as f64;
+        let (sample, fix) = (imu.samples.rows()[row], fixes.fixes[row]);
+        assert!((sample.time_s - time_s).abs() < 1e-6);
+        assert_eq!(fix.time_s, sample.time_s);
+        // ax ay az, not af al au; wx wy wz, not wf wl wu.
+        let at = |columns: [usize; 3]| Vector3::from(columns.map(|column| number(column, row)));
+        assert_eq!(sample.force_m_s2, at([11, 12, 13]));
+        assert_eq!(sample.rate_rad_s, at([17, 18, 19]));
+        assert_eq!(fix.position.latitude_deg, 49.0 + 1e-5 * row as f64);
+        assert_eq!(fix.position.longitude_deg, number(1, row));
+        assert_eq!(fix.position.height_m, number(2, row));
+        let accuracy_m = (row != 1).then(|| number(23, row));
+        assert_eq!((fix.horizontal_m, fix.vertical_m), (accuracy_m, accuracy_m));
+    }
+    // By `calib_imu_to_velo.txt`.
+    let lidar_from_imu = degrees([-0.81, 0.32, -0.8], [0.1, -0.1, 0.8]);
+    let found = imu.lidar_from_imu.unwrap();
+    assert!(found.angle_to(&lidar_from_imu.rotation) < 1e-6, "{found}");
+    let antenna_m = Vector3::from(fixes.antenna_m.unwrap());
+    assert!((antenna_m - lidar_from_imu.translation.vector).norm() < 1e-6);
+    // A row without a time.
+    set.write(
+        &format!("{}/oxts/data/{ROWS:010}.txt", set.path),
+        "49 8 110 0 0 0",
+    );
+    let error = recording.read_fixes(&oxts).unwrap_err().to_string();
+    assert!(error.contains("timestamps.txt"), "{error}");
+}
+
+#[test]
 fn every_layout_has_the_points_times_and_poses_that_were_written() {
     let expected: Vec<Pose3> = (0..SCANS).map(world_from_lidar).collect();
     let expected = relative(&expected, &Pose3::identity());
