@@ -620,6 +620,33 @@ fn kitti_raw() -> DataSet {
     set
 }
 
+/// A folder of scans: positions and intensities as KITTI has them.
+fn generic_bin() -> DataSet {
+    let set = DataSet {
+        has_poses: false,
+        kiss: Some(Kiss::new("generic")),
+        ..DataSet::new("generic")
+    };
+    set.write_scans(|scan| format!("{scan:06}.bin"), position_and_intensity);
+    set
+}
+
+/// A folder of scans as PCD.
+fn generic_pcd() -> DataSet {
+    let set = DataSet {
+        has_poses: false,
+        kiss: Some(Kiss {
+            modules: "kiss_icp, pyntcloud",
+            ..Kiss::new("generic")
+        }),
+        ..DataSet::new("generic")
+    };
+    for scan in 0..SCANS {
+        set.write(&format!("{scan:06}.pcd"), pcd(&(set.points)(scan)));
+    }
+    set
+}
+
 /// nuScenes: two scenes in the tables, of which one is chosen, and a camera that is none of the sweeps.
 fn nuscenes() -> DataSet {
     let set = DataSet {
@@ -768,6 +795,8 @@ fn data_sets() -> Vec<DataSet> {
         nuscenes(),
         apollo(),
         paris_luco(),
+        generic_bin(),
+        generic_pcd(),
     ]
 }
 
@@ -943,24 +972,64 @@ fn every_layout_is_read_as_kiss_icp_reads_it() {
             common::skips::skipped(format!("{}: no Python has {}", set.name, kiss.modules));
             continue;
         };
-        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/kiss_icp/read.py");
         let folder = set.folder.path().join(kiss.path.unwrap_or(set.path));
-        let mut command = std::process::Command::new(python);
-        let output = (command
-            .arg(script)
-            .arg(kiss.loader)
-            .arg(folder)
-            .arg(kiss.sequence))
-        .output()
-        .unwrap();
-        assert!(
-            output.status.success(),
-            "{}: {}",
-            set.name,
-            String::from_utf8_lossy(&output.stderr)
-        );
-        compare_with_kiss_icp(&set, kiss, &serde_json::from_slice(&output.stdout).unwrap());
+        let folder = folder.to_str().unwrap();
+        let theirs = run_python(&python, "read.py", &[kiss.loader, folder, kiss.sequence]);
+        compare_with_kiss_icp(&set, kiss, &serde_json::from_str(&theirs).unwrap());
     }
+}
+
+/// Runs a script of `tests/kiss_icp`, and returns what it prints.
+#[track_caller]
+fn run_python(python: &Path, script: &str, arguments: &[&str]) -> String {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/kiss_icp");
+    let mut command = std::process::Command::new(python);
+    let command = command.arg(folder.join(script)).args(arguments);
+    let output = command.output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{script} {arguments:?}: {stderr}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[cfg(feature = "bags")]
+#[test]
+fn bags_are_read_as_kiss_icp_reads_them() {
+    let modules = "kiss_icp, rosbags";
+    let Some(python) = common::python_with(modules, "kiss_icp") else {
+        common::skips::skipped(format!("bags: no Python has {modules}"));
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    run_python(&python, "write_bags.py", &[folder.path().to_str().unwrap()]);
+    for name in ["ros1.bag", "sqlite", "mcap"] {
+        let path = folder.path().join(name);
+        let theirs = run_python(&python, "read.py", &["rosbag", path.to_str().unwrap()]);
+        let theirs: Value = serde_json::from_str(&theirs).unwrap();
+        let (scans, stamps_s) = (&theirs["scans"], numbers(&theirs["stamps"]));
+        let ours = Recording::open(&path).unwrap();
+        assert_eq!((ours.frames.len(), stamps_s.len()), (SCANS, SCANS));
+        for (scan, frame) in ours.frames.iter().enumerate() {
+            let ours = frame.read().unwrap();
+            let points = scans[scan]["points"].as_array().unwrap();
+            assert_eq!((ours.points.len(), points.len()), (3200, 3200), "{name}");
+            for (ours, theirs) in ours.points.iter().zip(points) {
+                assert_eq!(ours.to_array().map(f64::from), *numbers(theirs), "{name}");
+            }
+            // Ours are after the moment of the scan, theirs as in the message, after its stamp.
+            let times_s = numbers(&scans[scan]["times"]);
+            assert_eq!((ours.times_s.len(), times_s.len()), (3200, 3200), "{name}");
+            for (after_s, theirs_s) in ours.times_s.iter().zip(times_s) {
+                let ours_s = ours.time_s.unwrap() + f64::from(*after_s);
+                assert!((ours_s - stamps_s[scan] - theirs_s).abs() < 1e-4, "{name}");
+            }
+        }
+    }
+    // The file in the folder is the same bag.
+    let [of_folder, of_file] = ["mcap", "mcap/mcap.mcap"].map(|name| {
+        let recording = Recording::open(&folder.path().join(name)).unwrap();
+        recording.frames[1].read().unwrap()
+    });
+    assert_eq!(of_folder, of_file);
 }
 
 fn compare_with_kiss_icp(set: &DataSet, kiss: &Kiss, theirs: &Value) {
@@ -997,6 +1066,10 @@ fn compare_with_kiss_icp(set: &DataSet, kiss: &Kiss, theirs: &Value) {
                 );
             }
         }
+    }
+    if !set.has_poses {
+        assert!(theirs["poses"].is_null(), "{name}");
+        return;
     }
     let poses: Vec<Pose3> = (theirs["poses"].as_array().unwrap().iter())
         .map(|rows| {
