@@ -1143,6 +1143,19 @@ fn a_folder_in_another_layout_is_an_error_that_says_what_is_missing() {
         assert!(message.contains(needs), "{message}");
     }
     assert!("mulram".parse::<fpmcl::recording::Layout>().is_err());
+    // Those that KISS-ICP reads or names, too.
+    for (name, parts) in [
+        ("argoverse2", ["Arrow", "convert"]),
+        ("ouster", ["raw packets", "ouster-cli"]),
+        ("tum", ["not of a lidar", "bag"]),
+    ] {
+        let call = fpmcl("odometry").with("drive").with("--layout").with(name);
+        call.rejects_usage_with(&parts);
+        let call = fpmcl("benchmark").with(name).with("drive");
+        call.rejects_usage_with(&parts);
+    }
+    let call = fpmcl("odometry").with("drive").with("--layout=mulram");
+    call.rejects_usage_with(&["mulram", "kitti", "mulran"]);
     // The scans are scans of a folder, too.
     let mut set = mulran();
     set.path = "Ouster";

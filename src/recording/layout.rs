@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use serde::de::IntoDeserializer as _;
+use serde::de::{Error as _, IntoDeserializer as _};
 use serde::{Deserialize, Serialize};
 
 use super::scan_files::PointFormat;
@@ -52,11 +52,31 @@ pub enum Layout {
 impl FromStr for Layout {
     type Err = serde::de::value::Error;
 
-    /// A layout by its name in configurations, such as `mulran`.
+    /// A layout by its name in configurations, such as `mulran`. The error about a data set that is not read says what to do
+    /// instead.
     fn from_str(name: &str) -> Result<Self, Self::Err> {
+        if let Some((_, reason)) = NOT_READ.iter().find(|(known, _)| *known == name) {
+            return Err(Self::Err::custom(format!("`{name}` is not read: {reason}")));
+        }
         Self::deserialize(name.into_deserializer())
     }
 }
+
+/// Data sets that are not read: their names, the reasons, and what to do instead.
+const NOT_READ: [(&str, &str); 4] = [
+    ("argoverse2", ARGOVERSE_2),
+    ("argoverse_2", ARGOVERSE_2),
+    (
+        "ouster",
+        "a .pcap or .osf has raw packets, which the SDK of Ouster decodes; convert it by `ouster-cli source FILE save FILE.bag`, which is read",
+    ),
+    (
+        "tum",
+        "its images of a room are not of a lidar; clouds that are made of them are read as a folder of scans or from a bag",
+    ),
+];
+
+const ARGOVERSE_2: &str = "its .feather files are tables of Apache Arrow with the points of two lidars in the frame of the car; convert them to a folder of scans with times.txt, such as .npy or .ply, as pandas and numpy do";
 
 impl Layout {
     /// Name for reports.

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use anyhow::bail;
 use clap::Args;
@@ -18,6 +19,7 @@ use super::visible::{visible, visible_in_line};
 use crate::app::settings::{self, CommandConfig};
 use crate::file_path::{FilePath, text_of};
 use crate::files::has_extension;
+use crate::recording::Layout;
 
 /// Configuration and machine.
 #[derive(Clone, Debug, Args)]
@@ -81,8 +83,13 @@ pub struct RunArgs {
 #[derive(Clone, Debug, Args, Serialize)]
 pub struct RecordingArgs {
     /// Layout of the recording, such as kitti, mulran or nuscenes; by default as its files show. Sets the key `layout`.
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = layout)]
     pub layout: Option<String>,
+}
+
+/// Requires the name of a layout.
+fn layout(name: &str) -> Result<String, <Layout as FromStr>::Err> {
+    name.parse::<Layout>().map(|_| name.to_owned())
 }
 
 /// Loads the configuration of a command, and notes its file. Where the argument of the command is no

@@ -115,7 +115,9 @@ fn layout(name: &str) -> Result<LayoutArg, String> {
     match name {
         "auto" => Ok(LayoutArg(None)),
         name => {
-            let layout = name.parse().map_err(|error| format!("{error}, `auto`"))?;
+            let layout: Result<Layout, _> = name.parse();
+            let layout =
+                layout.map_err(|error| format!("{error}; `auto` finds it by the files"))?;
             Ok(LayoutArg(Some(layout)))
         }
     }
