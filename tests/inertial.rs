@@ -345,11 +345,31 @@ fn localize_compensates_scans_by_an_inertial_sensor_and_leaves_out_a_wrong_one()
     let (without, with) = (rmse_m("without"), rmse_m("with"));
     eprintln!("{without} m, with an inertial sensor {with} m");
     assert!(with < 0.7 * without, "{without} {with}");
+    // Its clock is 30 ms ahead, which is found and corrected; so it is where the result is refined.
+    let found = |name: &str| {
+        let report = json(&folder.join(name).join("report.json"));
+        report["about"]["inertial sensor"]
+            .as_str()
+            .unwrap_or_default()
+            .to_owned()
+    };
+    assert_eq!(found("without"), "");
+    for is_refined in [false, true] {
+        if is_refined {
+            let refine = fpmcl("refine").in_folder(folder).with("with/result.npz");
+            refine.succeeds();
+        }
+        let found = found("with");
+        let offset_ms = found.split("offset of its clock ").nth(1);
+        let offset_ms = offset_ms.and_then(|it| it.split(' ').next()?.parse::<f64>().ok());
+        assert!((offset_ms.unwrap() - 30.0).abs() < 10.0, "{found}");
+    }
 
     let imu = folder.join("street/drive_2/imu.csv");
     change_imu(&imu, &folder.join("late.csv"), |numbers| numbers[0] += 0.5);
     let output = localize("wrong").with("--imu=late.csv").succeeds();
     assert_left_out(&output, "");
+    assert_eq!(found("wrong"), "late.csv, left out");
     let poses = |name: &str| fs::read(folder.join(name).join("mcl_tum.txt")).unwrap();
     assert!(poses("wrong") == poses("without"));
 }

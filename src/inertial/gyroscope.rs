@@ -28,6 +28,11 @@ impl Gyroscope {
         }
     }
 
+    /// How the sensor is mounted and what it adds.
+    pub fn calibration(&self) -> &ImuCalibration {
+        &self.calibration
+    }
+
     /// A sensor without errors, in the axes and on the clock of the lidar.
     #[cfg(test)]
     pub fn exact(imu: &Imu) -> Self {

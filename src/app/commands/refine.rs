@@ -444,7 +444,8 @@ fn write_run(
         _ => motion_source::description(&config.motion),
     };
     let inputs = (&config.recording, &config.map_input);
-    let about = run_output::about(results, inputs, map, odometry, config.seed);
+    let mut about = run_output::about(results, inputs, map, odometry, config.seed);
+    about.extend(run_output::inertial(&config.inertial, &sequence.frames));
     let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
     run_output::write_report(files, results, &report)?;
     let path = config.result_file.display();

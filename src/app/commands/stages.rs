@@ -5,6 +5,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 use serde_json::{Value, json};
 
+use crate::app::report::run_output;
 use crate::app::run::arguments::yaml;
 use crate::app::run::input::is_bag;
 use crate::app::run::{Context, input, memory};
@@ -123,8 +124,12 @@ impl InertialConfig {
     ) -> Result<Recording> {
         let recording = self.open(recording)?;
         let interrupt = &context.interrupt;
-        calibrated(recording, odometry, &|_| interrupt.flow())
-            .map_err(|error| interrupt.explain(error))
+        let recording = calibrated(recording, odometry, &|_| interrupt.flow())
+            .map_err(|error| interrupt.explain(error))?;
+        if let Some((name, found)) = run_output::inertial(self, &recording.frames) {
+            tracing::info!("{name}: {found}");
+        }
+        Ok(recording)
     }
 }
 

@@ -13,7 +13,7 @@ use crate::app::report::results::{
     write_frames_csv, write_poses_npy,
 };
 use crate::app::run::{Claims, Outputs, output};
-use crate::app::settings::{MapInputConfig, RecordingConfig};
+use crate::app::settings::{InertialConfig, MapInputConfig, RecordingConfig};
 use crate::evaluation::metrics::pick;
 use crate::evaluation::{
     EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, SpatialMetrics,
@@ -301,6 +301,24 @@ pub fn about(
     .into_iter()
     .chain(shortfall(results))
     .collect()
+}
+
+/// The entry of a report about the inertial sensor of a recording: what was found about it, or that it is left out.
+pub fn inertial(config: &InertialConfig, frames: &[Frame]) -> Option<(String, String)> {
+    let path = config.imu_file.as_ref()?.display();
+    let found = match &frames.first()?.gyroscope {
+        Some(gyroscope) => {
+            let calibration = gyroscope.calibration();
+            let (roll, pitch, yaw) = calibration.lidar_from_imu.euler_angles();
+            let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_degrees);
+            let offset_ms = 1e3 * calibration.offset_s;
+            format!(
+                "{path}, offset of its clock {offset_ms:.1} ms, axes roll {roll:.1}, pitch {pitch:.1}, yaw {yaw:.1} deg"
+            )
+        }
+        None => format!("{path}, left out"),
+    };
+    Some(("inertial sensor".to_owned(), found))
 }
 
 /// The entry of a report about a result that is not complete.

@@ -63,7 +63,7 @@ pub fn write_run(opened: &Opened, run: &mut Run, context: &Context) -> Result<Re
         files,
         map,
         sensor,
-        ..
+        recording,
     } = opened;
     let results = &run.results;
     warn_of_untracked_frames(results);
@@ -83,6 +83,7 @@ pub fn write_run(opened: &Opened, run: &mut Run, context: &Context) -> Result<Re
         ),
         ("states".to_owned(), states_in_words(results)),
     ]);
+    about.extend(run_output::inertial(&config.inertial, &recording.frames));
     let report = Report {
         live: run.live.clone(),
         ..run_output::evaluate(results, &RangeMclRules::default(), about)?
