@@ -7,9 +7,9 @@ mod common;
 use std::fs;
 use std::path::Path;
 
-use common::{fpmcl, json, run, simulate_two_drives};
-use fpmcl::georeference::{GeodeticFixes, Wgs84};
-use fpmcl::recording::read_fixes;
+use common::{Fpmcl, fpmcl, json, run, simulate_two_drives};
+use fpmcl::georeference::{GeodeticFix, GeodeticFixes, Wgs84};
+use fpmcl::recording::{read_fixes, read_tum};
 use serde_json::Value;
 
 /// A street with a bend, and a receiver of 2 cm in the southern hemisphere.
@@ -59,6 +59,61 @@ fn distances_m(geojson: &Value, fixes: &GeodeticFixes) -> [f64; 2] {
     largest_m
 }
 
+/// Sentences of NMEA with the positions and standard deviations of fixes.
+fn nmea(fixes: &GeodeticFixes) -> String {
+    let sentence = |text: String| {
+        let checksum = text.bytes().fold(0, |sum, byte| sum ^ byte);
+        format!("${text}*{checksum:02X}\r\n")
+    };
+    let degrees_and_minutes = |degrees: f64, width: usize| {
+        let minutes = 60.0 * degrees.abs().fract();
+        format!("{:0width$}{minutes:011.8}", degrees.abs().trunc())
+    };
+    let sentences = |fix: &GeodeticFix| {
+        // Within the first minute of a day.
+        let time = format!("0000{:05.2}", fix.time_s);
+        let at = fix.position;
+        let latitude = degrees_and_minutes(at.latitude_deg, 2);
+        let longitude = degrees_and_minutes(at.longitude_deg, 3);
+        let [south, west] = [at.latitude_deg, at.longitude_deg].map(|it| it < 0.0);
+        let (ns, ew) = (if south { 'S' } else { 'N' }, if west { 'W' } else { 'E' });
+        let height_m = at.height_m;
+        let [horizontal_m, vertical_m] = [fix.horizontal_m, fix.vertical_m].map(Option::unwrap);
+        [
+            sentence(format!(
+                "GPGGA,{time},{latitude},{ns},{longitude},{ew},4,10,0.8,{height_m:.3},M,0.0,M,,"
+            )),
+            sentence(format!(
+                "GPGST,{time},0.1,,,,{horizontal_m:.3},{horizontal_m:.3},{vertical_m:.3}"
+            )),
+        ]
+        .concat()
+    };
+    fixes.fixes.iter().map(sentences).collect()
+}
+
+/// Start in a map by the positions of a file, as `localize` reports it: x, y and the radius [m].
+#[track_caller]
+fn start_of(stderr: &str, file: &str) -> [f64; 3] {
+    let line = stderr
+        .lines()
+        .find_map(|line| line.split_once(&format!("start by {file}: (")));
+    let text = line.unwrap_or_else(|| panic!("no start in {stderr}")).1;
+    let words = text.split(|letter: char| !matches!(letter, '0'..='9' | '.' | '-'));
+    let numbers: Vec<f64> = words.filter_map(|word| word.parse().ok()).collect();
+    assert!(
+        text.contains("in any heading") && numbers.len() == 3,
+        "{text}"
+    );
+    [numbers[0], numbers[1], numbers[2]]
+}
+
+/// A call in a folder.
+fn call(folder: &Path, arguments: &[&str]) -> Fpmcl {
+    let call = fpmcl("").in_folder(folder);
+    arguments.iter().fold(call, Fpmcl::with)
+}
+
 fn require_near(geojson: &Path, fixes: &GeodeticFixes) {
     let [horizontal_m, vertical_m] = distances_m(&json(geojson), fixes);
     assert!(
@@ -99,8 +154,50 @@ fn a_drive_in_a_map_on_the_earth_is_where_its_receiver_was() {
     let start = ["--gnss", "street/drive_2/gnss.csv"];
     let localize = ["localize", "street/drive_2", "--map", "map.ply"];
     let output = ["--output", "out/localization.npz"];
-    run(folder, &[&localize[..], &start, &output].concat());
+    let localized = call(folder, &[&localize[..], &start, &output].concat()).succeeds();
+    let [x_m, y_m, within_m] = start_of(&localized.stderr, "street/drive_2/gnss.csv");
     require_near(&folder.join("out/mcl.geojson"), &fixes(2));
+    // It is where the drive begins, at 8 m/s.
+    let first = read_tum(&folder.join("out/mcl_tum.txt")).unwrap()[0];
+    let at = first.map_from_lidar.translation;
+    let driven_m = 9.0 * first.time_s;
+    let distance_m = (at.x - x_m).hypot(at.y - y_m);
+    assert!(within_m < 1.5, "{within_m}");
+    assert!(
+        distance_m < within_m + driven_m + 0.1,
+        "{distance_m} {driven_m}"
+    );
+
+    // The same positions as sentences of NMEA, whose times are those of the day.
+    fs::write(folder.join("drive.nmea"), nmea(&fixes(2))).unwrap();
+    let arguments = ["--gnss", "drive.nmea", "--output", "nmea/localization.npz"];
+    let localized = call(folder, &[&localize[..], &arguments].concat()).succeeds();
+    let start = start_of(&localized.stderr, "drive.nmea");
+    for (found_m, expected_m) in start.into_iter().zip([x_m, y_m, within_m]) {
+        assert!((found_m - expected_m).abs() < 0.15, "{start:?}");
+    }
+    require_near(&folder.join("nmea/mcl.geojson"), &fixes(2));
+
+    // The refined path and the tiles are at the same place.
+    run(folder, &["refine", "out/localization.npz"]);
+    require_near(&folder.join("out/refined.geojson"), &fixes(2));
+    run(folder, &["export", "map.ply", "--pcd", "tiles"]);
+    let metadata = folder.join("tiles/pointcloud_map_metadata.yaml");
+    let metadata = fs::read_to_string(metadata).unwrap();
+    let comment = metadata
+        .lines()
+        .find_map(|line| line.strip_prefix("# georeference: "));
+    let of_tiles: Value = serde_json::from_str(comment.unwrap()).unwrap();
+    for key in [
+        "latitude_deg",
+        "longitude_deg",
+        "height_m",
+        "yaw_deg",
+        "utm",
+    ] {
+        assert!(!of_tiles[key].is_null());
+        assert_eq!(of_tiles[key], info["georeference"][key], "{key}");
+    }
     run(
         folder,
         &["export", "out/localization.npz", "--geojson", "run.geojson"],
@@ -134,10 +231,7 @@ fn what_is_missing_is_an_error_that_says_what_to_do() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     simulate_two_drives(folder, SIMULATION);
-    let call = |arguments: &[&str]| {
-        let call = fpmcl("").in_folder(folder);
-        arguments.iter().fold(call, common::Fpmcl::with)
-    };
+    let call = |arguments: &[&str]| call(folder, arguments);
     run(
         folder,
         &["build-map", "street/drive_1", "--output", "map.ply"],
