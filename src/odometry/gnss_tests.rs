@@ -4,6 +4,7 @@ use nalgebra::UnitQuaternion;
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 use rand_distr::StandardNormal;
 
+use super::super::level::Levels;
 use super::super::sampling::Sample;
 use super::*;
 use crate::georeference::{Geodetic, GeodeticFix, Georeference, HeightReference, UtmZone};
@@ -22,7 +23,12 @@ fn truth() -> (Vec<Pose3>, Vec<f64>) {
 
 /// What odometry with a bias of its turns finds: metres off after two rounds.
 fn drifting(truth: &[Pose3]) -> Drive {
-    let bias = Pose3::new(Vector3::zeros(), Vector3::new(0.0, 1e-5, 6e-5));
+    drifting_by(truth, Vector3::new(0.0, 1e-5, 6e-5))
+}
+
+/// The same with another bias per scan [rad].
+fn drifting_by(truth: &[Pose3], bias_rad: Vector3<f64>) -> Drive {
+    let bias = Pose3::new(Vector3::zeros(), bias_rad);
     let mut poses = vec![truth[0]];
     for pair in truth.windows(2) {
         let step = pair[0].inverse() * pair[1];
@@ -142,4 +148,33 @@ fn a_path_that_is_right_stays() {
         .map(|(a, b)| (a.translation.vector - b.translation.vector).norm());
     let largest_m = errors.fold(0.0, f64::max);
     assert!(largest_m < 0.02, "{largest_m}");
+}
+
+#[test]
+fn a_path_that_follows_fixes_keeps_the_directions_up_of_an_accelerometer() {
+    let (truth, times_s) = truth();
+    let mut gnss = fixes(&truth, &times_s, 0.5, 0.0);
+    // Heights that do not show the tilt of the path.
+    for fix in &mut gnss.fixes.fixes {
+        fix.vertical_m = Some(30.0);
+    }
+    let drifting = drifting_by(&truth, Vector3::new(0.0, 1e-4, 6e-5));
+    let bent = |levels: Option<Levels>| {
+        let mut drive = Drive {
+            levels,
+            ..drifting.clone()
+        };
+        bend(&mut drive, &times_s, &odometry(truth.len()), &[], &gnss).unwrap();
+        let up = |pose: &Pose3| pose.rotation.inverse() * Vector3::z();
+        let tilts = zip(&drive.poses, &truth).map(|(found, truth)| up(found).angle(&up(truth)));
+        let tilt_deg = (tilts.sum::<f64>() / truth.len() as f64).to_degrees();
+        (tilt_deg, errors_m(&drive.poses, &truth, &times_s)[0])
+    };
+    let before_m = errors_m(&drifting.poses, &truth, &times_s)[0];
+    let (without_deg, _) = bent(None);
+    let (with_deg, with_m) = bent(Some(Levels::new(vec![Vector3::z(); truth.len()], 1e6)));
+    assert!(without_deg > 0.3, "{without_deg}");
+    assert!(with_deg < 0.3 * without_deg, "{without_deg} {with_deg}");
+    // They are followed in the plane as without.
+    assert!(with_m < 0.5 * before_m, "{before_m} {with_m}");
 }

@@ -37,6 +37,15 @@ pub struct Levels {
 }
 
 impl Levels {
+    /// Directions up in the lidar frame of each scan, and the information of one of them [1/rad²].
+    #[cfg(test)]
+    pub fn new(up_in_lidar: Vec<Vector3<f64>>, information: f64) -> Self {
+        Self {
+            up_in_lidar,
+            information,
+        }
+    }
+
     /// Adds the deviation of a pose, that of a row of the drive, from its direction up, as often as that of one scan counts.
     pub fn add_to(
         &self,
