@@ -19,6 +19,7 @@ use smart_default::SmartDefault;
 
 use crate::geometry::Pose2;
 use crate::localization::OdometryNoise;
+use crate::localization::motion::TurnDriveTurn;
 use crate::localization::particles::deviation;
 use crate::statistics::median;
 use crate::validation::{InvalidValue, Validate, fraction, in_range, positive};
@@ -53,14 +54,16 @@ pub struct SmoothingConfig {
 }
 
 impl SmoothingConfig {
-    /// The configuration whose deviations of the odometry are at least those of a noise on it.
+    /// The configuration whose deviations of the odometry are at least those of a noise on steps straight ahead of a length,
+    /// whose first turn moves their end aside.
     #[must_use]
-    pub fn with_noise(&self, noise: &OdometryNoise) -> Self {
-        let turn_rad = std::f64::consts::SQRT_2 * noise.turn_rad;
+    pub fn with_noise(&self, noise: &OdometryNoise, step_m: f64) -> Self {
+        let step = TurnDriveTurn::decompose(&Pose2::translation(step_m, 0.0));
+        let sigmas = noise.covariance(&step).diagonal().map(f64::sqrt);
         Self {
-            odometry_ahead_m: self.odometry_ahead_m.max(noise.drive_m),
-            odometry_aside_m: self.odometry_aside_m.max(noise.turn_rad),
-            odometry_turn_rad: self.odometry_turn_rad.max(turn_rad),
+            odometry_ahead_m: self.odometry_ahead_m.max(sigmas.x),
+            odometry_aside_m: self.odometry_aside_m.max(sigmas.y),
+            odometry_turn_rad: self.odometry_turn_rad.max(sigmas.z),
             ..self.clone()
         }
     }
@@ -716,10 +719,19 @@ mod tests {
         // What the covariances of the poses explain is no noise of the odometry.
         assert_eq!(found.odometry_aside_m, config.odometry_aside_m);
         assert_eq!(found.odometry_turn_rad, config.odometry_turn_rad);
-        let noise = OdometryNoise::constant(0.04, 0.2, 0.0);
-        let with_noise = config.with_noise(&noise);
-        assert_eq!(with_noise.odometry_ahead_m, 0.2);
-        assert_eq!(with_noise.odometry_aside_m, 0.04);
+    }
+
+    #[test]
+    fn a_noise_on_the_odometry_is_its_least_deviation_per_step() {
+        let config = SmoothingConfig::default();
+        // A turn of 0.04 rad moves the end of a step of 2 m by 0.08 m; there are two of them.
+        let found = config.with_noise(&OdometryNoise::constant(0.04, 0.2, 0.06), 2.0);
+        assert_relative_eq!(found.odometry_ahead_m, 0.2, epsilon = 1e-12);
+        assert_relative_eq!(found.odometry_aside_m, 0.1, epsilon = 1e-12);
+        let turn_rad = std::f64::consts::SQRT_2 * 0.04;
+        assert_relative_eq!(found.odometry_turn_rad, turn_rad, epsilon = 1e-12);
+        let small = OdometryNoise::constant(1e-4, 1e-3, 1e-3);
+        assert_eq!(config.with_noise(&small, 1.0), config);
     }
 
     #[test]

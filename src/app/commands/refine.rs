@@ -304,7 +304,8 @@ fn refine(
         "{} is unchanged: a trajectory is refined as a whole",
         config.result_file.display()
     ));
-    let mut refiner = TrajectoryRefiner::new(map, sensor, refiner_config(config), config.seed)?;
+    let refiner = refiner_config(config, increments);
+    let mut refiner = TrajectoryRefiner::new(map, sensor, refiner, config.seed)?;
     let mut runtimes_s = Vec::with_capacity(starts.len());
     let task = context.progress.task("refine", starts.len());
     for (frame, start) in frames.iter().zip(starts) {
@@ -412,11 +413,14 @@ fn increments(
 
 /// The configuration of the refiner; the noise that the demonstration adds to the true odometry is
 /// never assumed smaller than it is.
-fn refiner_config(config: &RefinementConfig) -> RefinerConfig {
+fn refiner_config(config: &RefinementConfig, increments: &[Option<Pose2>]) -> RefinerConfig {
     let mut refiner = config.refiner.clone();
     if config.motion.odometry == OdometrySource::GroundTruth {
         let smoothing = &mut refiner.refinement.smoothing;
-        *smoothing = smoothing.with_noise(&demonstration_noise());
+        // The first has no motion into it.
+        let steps_m = increments.iter().skip(1).flatten();
+        let step_m = median(steps_m.map(|step| step.translation.vector.norm()));
+        *smoothing = smoothing.with_noise(&demonstration_noise(), step_m.unwrap_or(0.0));
     }
     refiner
 }
