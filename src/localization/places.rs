@@ -44,7 +44,8 @@ pub struct PlacesConfig {
     /// Weight from which on a place is counted as likely, 0 to 1.
     #[default(0.01)]
     pub likely_weight: f64,
-    /// Weight below which a place is given up, 0 to 1.
+    /// Weight below which a place is given up, 0 to 1. All of the 40 places that are registered in a frame weigh less than
+    /// 0.00004 together then: the probability that the right one is given up, as far as the weights are right.
     #[default(1e-6)]
     pub given_up_weight: f64,
 }

@@ -29,7 +29,8 @@ pub struct TimingComparison {
     pub best: Option<usize>,
 }
 
-/// Smallest difference between the largest and the least residual that decides, as a share of the least.
+/// Smallest difference between the largest and the least residual that decides, as a share of the least. Errors of wrong times
+/// add to those of the scans in squares: this share is theirs if they are a third of these, √(1.05² − 1).
 const SPREAD: f64 = 0.05;
 
 /// A run of scans whose timing cannot be compared.
@@ -199,7 +200,8 @@ impl<'a> Runs<'a> {
     /// The start of the revolution with the least residual among a first one and those by quarters of a turn from it. Points
     /// between a wrong start and the right one are off by a whole period.
     fn best_quarter(&self, first: Rotation) -> Result<Fitted, TimingError> {
-        /// Decrease of the residual by which another start than the first is better (unitless).
+        /// Decrease of the residual by which another start than the first is better (unitless): it takes away errors that are
+        /// a quarter of all, √(1 − 0.97²), since they add in squares.
         const BETTER: f64 = 0.03;
         let turned = quarters(first);
         let residuals_m = self.residuals_of(&turned)?;

@@ -45,7 +45,8 @@ pub struct SmoothingConfig {
     /// surfaces (unitless).
     #[default(0.25)]
     pub independent_share: f64,
-    /// Scale c of the robust kernel (standard deviations).
+    /// Scale c of the robust kernel (standard deviations): a pose that is c off has half of the weight. Of errors of x, y and
+    /// heading that are normal, 2.9 % are beyond 3.
     #[default(3.0)]
     pub robust_sigmas: f64,
     /// Largest number of iterations.
