@@ -3,9 +3,9 @@
 //! its results must be those of an uninterrupted run, without files left over and without foreign
 //! files lost.
 //!
-//! `cargo test --release --test faults -- --ignored --nocapture` is the campaign. It stops each command
-//! 100 times, or as often as `FPMCL_FAULT_TRIES` says, and prints a table; `FPMCL_FAULT_COMMANDS=compare,simulate`
-//! stops only these. The moments follow from a seed.
+//! `FPMCL_FAULT_TRIES=100 cargo test --release --test faults campaign -- --nocapture` is the campaign. It stops each
+//! command as often as that and prints a table; `FPMCL_FAULT_COMMANDS=compare,simulate` stops only these. The moments
+//! follow from a seed.
 
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
@@ -21,6 +21,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
+use common::skips::skipped;
 use common::{COMPARISON_OF_STREET, Recording};
 use fpmcl::internals::app::LocalizationResults;
 use rand::RngExt as _;
@@ -645,9 +646,12 @@ fn a_command_that_is_stopped_gives_the_same_results_when_it_runs_again() {
 }
 
 #[test]
-#[ignore = "the campaign: half an hour"]
 fn campaign() {
-    let tries = std::env::var("FPMCL_FAULT_TRIES").map_or(100, |text| text.parse().unwrap());
+    let Ok(tries) = std::env::var("FPMCL_FAULT_TRIES") else {
+        skipped("FPMCL_FAULT_TRIES is not set: the campaign takes half an hour");
+        return;
+    };
+    let tries = tries.parse().unwrap();
     let commands = std::env::var("FPMCL_FAULT_COMMANDS").ok();
     let is_chosen = |stage: &&Stage| {
         let names = commands.as_deref().map(|names| names.split(','));
@@ -663,7 +667,7 @@ fn campaign() {
         for row in disks {
             match row {
                 Some(row) => rows.push(row),
-                None => println!("not run: a disk of its own for {} needs root", stage.name),
+                None => skipped(format!("a disk of its own for {} needs root", stage.name)),
             }
         }
         rows.iter().for_each(Row::print);
