@@ -203,8 +203,12 @@ fn a_drive_that_leaves_a_map_is_in_its_frame_although_one_pose_in_it_is_wrong() 
     let last_m = errors_m[27];
     assert!(inside_m < 0.02 && last_m < 0.05, "{errors_m:?}");
 
-    let nowhere = builder.finish_in_map(&mesh, &[None; 28]);
+    let nowhere = builder.clone().finish_in_map(&mesh, &[None; 28]);
     assert_eq!(nowhere.unwrap_err(), NotInMap.into());
+    // No share of the surfaces is larger than all of them.
+    builder.config.loop_closure.min_common_share = 1.0;
+    let strict = builder.finish_in_map(&mesh, &found);
+    assert_eq!(strict.unwrap_err(), NotInMap.into());
 }
 
 #[test]

@@ -330,12 +330,14 @@ fn finish(
 
 #[cfg(test)]
 mod tests {
+    use approx::assert_relative_eq;
     use nalgebra::{Vector2, Vector3};
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
     use crate::geometry::Vec3;
     use crate::lidar::{LidarModel, RangeImage};
+    use crate::map::gaussian_for_tests::GaussianWorld;
     use crate::map::world_for_tests::TestWorld;
     use crate::registration::register;
     use crate::rendering::{RangeDifference, RangeRenderer, SurfaceHit};
@@ -400,12 +402,12 @@ mod tests {
     }
 
     /// A renderer whose surfaces contradict its ranges: Gauss-Newton is led astray.
-    struct Astray {
-        ranges: TestWorld,
+    struct Astray<'a> {
+        ranges: &'a dyn RangeRenderer,
         surfaces: TestWorld,
     }
 
-    impl RangeRenderer for Astray {
+    impl RangeRenderer for Astray<'_> {
         fn name(&self) -> String {
             "astray".into()
         }
@@ -457,11 +459,11 @@ mod tests {
 
     #[test]
     fn a_step_of_gauss_newton_that_raises_the_cost_is_rejected() {
+        let world = TestWorld::street();
         let renderer = Astray {
-            ranges: TestWorld::street(),
+            ranges: &world,
             surfaces: TestWorld::moved_street(Pose2::translation(0.08, 0.06)),
         };
-        let world = &renderer.ranges;
         let truth = world.pose_at(18.0, 0.2, 0.05);
         let beams: Vec<Beam> = world.scan(&truth).beams().step_by(7).collect();
         let objective = FrameObjective {
@@ -488,6 +490,71 @@ mod tests {
             assert_eq!(frame.pose, truth);
             assert_eq!(frame.cost_after_m, frame.cost_before_m);
         }
+    }
+
+    #[test]
+    fn a_registered_frame_has_the_covariance_of_its_registration() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(18.0, 0.2, 0.05);
+        let beams: Vec<Beam> = world.scan(&truth).beams().step_by(7).collect();
+        let estimate = truth * Pose2::new(Vector2::new(0.08, -0.06), 0.006);
+        let config = FrameRefinementConfig {
+            method: Method::GaussNewton,
+            ..FrameRefinementConfig::default()
+        };
+        let covariance = Matrix3::from_diagonal(&Vector3::new(0.0025, 0.0025, 1e-4));
+        let objective = world.objective(&beams);
+        let (distance, mut rng) = (Distance::InBasin, StdRng::seed_from_u64(1));
+        let frame = refine_frame(
+            &objective,
+            &estimate,
+            &covariance,
+            distance,
+            &config,
+            &mut rng,
+        );
+        let frame = frame.unwrap().unwrap();
+        let start = &frame.start_in_space;
+        let registered = register_informative(&world, &beams, start, &config.gauss_newton);
+        let registered = registered.unwrap().unwrap();
+        assert_eq!(frame.map_from_lidar, registered.map_from_lidar);
+        assert_eq!(frame.covariance, registered.planar_covariance());
+    }
+
+    #[test]
+    fn a_frame_whose_registration_is_rejected_has_the_covariance_of_the_objective() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(18.0, 0.2, 0.05);
+        let beams: Vec<Beam> = world.scan(&truth).beams().step_by(7).collect();
+        let config = FrameRefinementConfig {
+            method: Method::GaussNewton,
+            ..FrameRefinementConfig::default()
+        };
+        let expected = Matrix3::new(
+            25e-4, 9e-4, 4e-5, //
+            9e-4, 16e-4, 2e-5, //
+            4e-5, 2e-5, 16e-6,
+        );
+        // The costs are those of a Gaussian around the estimate, from which the surfaces lead away.
+        let ranges = GaussianWorld {
+            mean: truth,
+            information: expected.try_inverse().unwrap(),
+            scale_m: config.scale_m,
+        };
+        let renderer = Astray {
+            ranges: &ranges,
+            surfaces: TestWorld::moved_street(Pose2::translation(0.08, 0.06)),
+        };
+        let objective = FrameObjective {
+            renderer: &renderer,
+            ..world.objective(&beams)
+        };
+        let (covariance, mut rng) = (1e-4 * Matrix3::identity(), StdRng::seed_from_u64(1));
+        let distance = Distance::InBasin;
+        let frame = refine_frame(&objective, &truth, &covariance, distance, &config, &mut rng);
+        let frame = frame.unwrap().unwrap();
+        assert_eq!(frame.pose, truth);
+        assert_relative_eq!(frame.covariance, expected, max_relative = 1e-3);
     }
 
     #[test]

@@ -693,6 +693,9 @@ impl FrameResult {
 
 #[cfg(test)]
 mod tests {
+    use approx::assert_relative_eq;
+
+    use super::super::refiner::Method;
     use super::*;
     use crate::lidar::LidarModel;
     use crate::map::world_for_tests::TestWorld;
@@ -733,6 +736,61 @@ mod tests {
         for (before, after) in before.iter().zip(&refined.poses) {
             let off_m = (after.translation.vector - before.translation.vector).norm();
             assert!(off_m < 1e-6, "{off_m}");
+        }
+    }
+
+    #[test]
+    fn a_frame_has_the_covariance_of_its_refinement() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(10.0, 0.0, 0.0);
+        let points = world.scan(&truth).points;
+        let scan = Scan {
+            points,
+            ..Scan::default()
+        };
+        let given = Matrix3::from_diagonal(&Vector3::new(0.01, 0.02, 1e-4));
+        let covariance = |method: Method| {
+            let mut config = RefinerConfig::default();
+            config.refinement.method = method;
+            let mut refiner = TrajectoryRefiner::new(&world.map(), &sensor(), config, 0).unwrap();
+            let estimate = InitialEstimate {
+                covariance: Some(given),
+                ..InitialEstimate::tracked(truth)
+            };
+            refiner.add(&scan, &estimate).unwrap().covariance
+        };
+        // A refinement without a step keeps that of the estimate; the map is exact to centimetres.
+        assert_eq!(covariance(Method::None), given);
+        let registered = covariance(Method::GaussNewton);
+        assert!(registered.trace() < 0.1 * given.trace(), "{registered}");
+    }
+
+    #[test]
+    fn smoothing_does_not_reduce_the_error_that_the_map_has_in_all_frames() {
+        let map = TestWorld::street().map();
+        let covariances = |map_error_m: f64| {
+            let mut config = RefinerConfig::default();
+            config.refinement.gauss_newton.map_error_m = map_error_m;
+            let mut refiner = TrajectoryRefiner::new(&map, &sensor(), config, 0).unwrap();
+            for row in 0..20 {
+                let pose = Pose2::translation(f64::from(row), 0.0);
+                refiner.frames.push(FrameResult {
+                    pose,
+                    map_from_lidar: Some(pose3_from_pose2(&pose, 0.0)),
+                    covariance: Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6)),
+                    state: State::Tracking,
+                    change: None,
+                    attitude: SensorAttitude::default(),
+                    level_m: None,
+                });
+            }
+            let increments = vec![Pose2::translation(1.0, 0.0); 20];
+            refiner.finish(Some(&increments)).unwrap().covariances
+        };
+        let [small, large] = [0.01, 0.03].map(covariances);
+        let expected = Matrix3::from_diagonal(&Vector3::new(8e-4, 8e-4, 0.0));
+        for (small, large) in small.iter().zip(&large) {
+            assert_relative_eq!(large - small, expected, epsilon = 1e-12);
         }
     }
 

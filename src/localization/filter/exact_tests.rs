@@ -170,6 +170,47 @@ fn the_scan_of_a_standing_car_that_agrees_far_less_than_usual_is_used() {
 }
 
 #[test]
+fn the_pose_of_an_update_whose_scan_agrees_far_less_than_usual_is_not_sure() {
+    const USUAL: f64 = 0.98;
+    let street = TestWorld::street();
+    let start = street.pose_at(0.0, 0.0, 0.7);
+    let ahead = Pose2::translation(0.5, 0.0);
+    // Particles that cannot follow a scan that was turned.
+    let mut config = LocalizerConfig {
+        motion: OdometryNoise::constant(1e-4, 1e-3, 1e-3),
+        ..LocalizerConfig::of_test(3)
+    };
+    config.proposal.scan = false;
+    let limits = config.tracking_loss.clone();
+    let step = |usual: Option<f64>, turned_rad: f64| {
+        let mut filter = tracking(config.clone(), start, Matrix3::zeros());
+        filter.agreement.observe(usual, &limits);
+        let scan = street.scan(&(start * ahead * Pose2::rotation(turned_rad)));
+        let (moved, attitude) = (Odometry::Increment(ahead), SensorAttitude::default());
+        let mut rng = StdRng::seed_from_u64(1);
+        let frame = filter.step(moved, &scan, &attitude, &mut rng).unwrap();
+        assert!(frame.updated);
+        frame
+    };
+    let (mut low, mut usual) = (0, 0);
+    for turned_rad in (0..60).map(|i| 0.002 * f64::from(i)) {
+        // Without a usual share, only that of the scan decides.
+        let without = step(None, turned_rad);
+        if without.state != State::Tracking {
+            continue;
+        }
+        let share = without.agreement.unwrap();
+        let slow = USUAL + limits.slow_rate * (share - USUAL);
+        let is_low = share < limits.lost_fraction * slow;
+        let is_tracked = step(Some(USUAL), turned_rad).state == State::Tracking;
+        assert_eq!(is_tracked, !is_low, "{share}");
+        low += usize::from(is_low);
+        usual += usize::from(!is_low);
+    }
+    assert!(low > 0 && usual > 0, "{low} {usual}");
+}
+
+#[test]
 fn the_uncertain_heading_of_a_creeping_car_makes_its_position_uncertain() {
     let config = LocalizerConfig {
         motion: OdometryNoise::constant(0.0, 0.0, 0.0),
