@@ -391,7 +391,9 @@ fn results() {
         "results.npz",
         fuzzed::npz::results,
         |file| {
-            let results = LocalizationResults::read(file.path).map_err(text)?;
+            let read = LocalizationResults::read(file.path).map_err(text)?;
+            // True poses may be unknown; all others are finite.
+            let results = read.with_truth_only().into_owned();
             check_results(&results);
             results.write(&file.written()).unwrap();
             let again = LocalizationResults::read(&file.written()).unwrap();

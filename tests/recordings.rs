@@ -7,6 +7,7 @@ mod common;
 use std::fs;
 
 use common::{Recording, fpmcl};
+use fpmcl::internals::app::LocalizationResults;
 
 const FRAMES: usize = 6;
 
@@ -134,31 +135,76 @@ fn poses_of_the_lidar_need_no_calibration() {
     }
 }
 
+/// All that a run found: its trajectory as bytes, and its result without the truth and the computing times.
+fn found(recording: &Recording, trajectory: &str) -> (Vec<u8>, LocalizationResults) {
+    let result = recording.path("results/localization.npz");
+    let mut results = LocalizationResults::read(&result).unwrap();
+    (results.ground_truth, results.ground_truth_in_space) = (None, None);
+    (results.runtimes_s, results.refine_runtimes_s) = (None, None);
+    (recording.bytes(trajectory), results)
+}
+
 #[test]
 fn a_truth_is_compared_with_and_changes_no_estimate() {
     let recording = Recording::street(FRAMES);
     recording.fpmcl("build-map").succeeds();
-    // Times that are not those of the scans, for which ten per second are assumed.
-    let truth = |ahead_m: f64| -> String {
+    let rows = |time_s: &dyn Fn(usize) -> f64, ahead_m: f64, count: usize| -> String {
         let row = |frame: usize| {
             let x_m = ahead_m + 0.5 * frame as f64;
-            format!("{} {x_m} 0 0 0 0 0 1\n", 3 * frame)
+            format!("{:.2} {x_m} 0 0 0 0 0 1\n", time_s(frame))
         };
-        (0..FRAMES).map(row).collect()
+        (0..count).map(row).collect()
     };
-    recording.write("right.txt", &truth(0.0));
-    recording.write("wrong.txt", &truth(25.0));
-    let estimates = ["null", "right.txt", "wrong.txt"].map(|truth| {
-        let call = recording.fpmcl("localize").with("--force");
+    // Times that are not those of the scans, for which ten per second are assumed.
+    let other = |frame: usize| 3.0 * frame as f64;
+    recording.write("right.txt", &rows(&other, 0.0, FRAMES));
+    recording.write("wrong.txt", &rows(&other, 25.0, FRAMES));
+    recording.write("short.txt", &rows(&other, 0.0, FRAMES - 1));
+    // Of recorded times, the first frame is before the truth.
+    let late = |frame: usize| 0.15 + 0.1 * frame as f64;
+    recording.write("late.txt", &rows(&late, 0.75, FRAMES));
+    let call = |command: &str, truth: &str| {
+        let call = recording.fpmcl(command).with("--force");
         let call = call.set("odometry", "auto").set("pose_file", truth);
-        let call = call.set("initial_pose", "[0, 0, 0]");
-        call.set("motion_compensation", "auto").succeeds();
-        let errors = String::from_utf8(recording.bytes("results/report.json")).unwrap();
-        (recording.bytes("results/mcl_tum.txt"), errors)
-    });
-    let [without, right, wrong] = estimates;
-    assert!(without.0 == right.0 && without.0 == wrong.0);
+        call.set("motion_compensation", "auto")
+    };
+    let localized = |truth: &str| {
+        let call = call("localize", truth).set("initial_pose", "[0, 0, 0]");
+        call.succeeds();
+        let report = recording.bytes("results/report.json");
+        (found(&recording, "results/mcl_tum.txt"), report)
+    };
+    let refined = |truth: &str| {
+        call("refine", truth).succeeds();
+        found(&recording, "results/refined_tum.txt")
+    };
+
+    let [right, wrong, short, without] =
+        ["right.txt", "wrong.txt", "short.txt", "null"].map(localized);
+    assert!(without.0.1.particles.len() == FRAMES && without.0.1.covariances.is_some());
+    assert!(without.0 == right.0 && without.0 == wrong.0 && without.0 == short.0);
     assert!(right.1 != wrong.1 && without.1 != right.1);
+    // That of the last run, which has no truth.
+    let [without, wrong, short] = ["null", "wrong.txt", "short.txt"].map(refined);
+    assert!(without.1.refined_covariances.is_some());
+    assert!(without == wrong && without == short);
+
+    let times: String = (0..FRAMES)
+        .map(|frame| format!("{:.1}\n", 0.1 * frame as f64))
+        .collect();
+    recording.write("times.txt", &times);
+    let [without, late] = ["null", "late.txt"].map(localized);
+    assert!(without.0 == late.0);
+    let result = recording.path("results/localization.npz");
+    let truth = LocalizationResults::read(&result).unwrap().ground_truth;
+    let is_unknown: Vec<bool> = (truth.unwrap().iter())
+        .map(|pose| pose.translation.x.is_nan())
+        .collect();
+    assert_eq!(is_unknown, [true, false, false, false, false, false]);
+    let evaluate = fpmcl("evaluate").in_folder(recording.folder());
+    let evaluate = evaluate.with("results/localization.npz").with("--force");
+    let said = evaluate.succeeds().stderr;
+    assert!(said.contains("1 of 6 frames are left out"), "{said}");
 }
 
 #[test]

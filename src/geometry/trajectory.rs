@@ -1,6 +1,6 @@
 //! Poses of trajectories.
 
-use nalgebra::Isometry;
+use nalgebra::{Isometry, SVector};
 
 use super::Pose3;
 
@@ -15,15 +15,16 @@ pub struct StampedPose {
     pub map_from_lidar: Pose3,
 }
 
-/// Distance driven up to each pose, starting at 0 [m].
+/// Distance driven up to each pose, starting at 0 [m]. Poses that are not a number are bridged by a straight line.
 pub fn distances_m<R, const D: usize>(poses: &[Isometry<f64, R, D>]) -> Vec<f64> {
-    let steps_m = poses
-        .windows(2)
-        .map(|pair| (pair[1].translation.vector - pair[0].translation.vector).norm());
+    let mut last: Option<SVector<f64, D>> = None;
     let mut driven_m = 0.0;
-    (poses.iter().take(1).map(|_| 0.0).chain(steps_m))
-        .map(|step_m| {
-            driven_m += step_m;
+    (poses.iter().map(|pose| pose.translation.vector))
+        .map(|place| {
+            if place.iter().all(|number| number.is_finite()) {
+                driven_m += last.map_or(0.0, |last| (place - last).norm());
+                last = Some(place);
+            }
             driven_m
         })
         .collect()

@@ -331,11 +331,13 @@ impl Recording {
                 frame.time_s = times_s.get(frame.number).copied().unwrap_or(frame.time_s);
             }
         }
-        self.with_truth(track)
+        let mut posed = self.with_truth(track)?;
+        posed.frames.retain(|frame| frame.map_from_lidar.is_some());
+        Ok(posed)
     }
 
-    /// The same recording, whose frames have the poses of a track as the truth that estimates are compared with: its times are
-    /// not used.
+    /// The same recording, whose frames have the poses of a track as the truth that estimates are compared with, where it has
+    /// one: its times are not used, and frames without one are kept.
     ///
     /// # Errors
     /// As [`with_poses`](Self::with_poses).
@@ -344,7 +346,6 @@ impl Recording {
         for (frame, pose) in self.frames.iter_mut().zip(poses) {
             frame.map_from_lidar = pose;
         }
-        self.frames.retain(|frame| frame.map_from_lidar.is_some());
         self.track = Some(track);
         Ok(self)
     }

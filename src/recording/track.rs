@@ -210,7 +210,7 @@ impl PoseTrack {
                 rest => format!(" and {rest} others"),
             };
             tracing::warn!(
-                "{} has no pose for these frames, which are left out: {}{rest}",
+                "{} has no pose for these frames: {}{rest}",
                 self.path.display(),
                 numbers.join(", ")
             );

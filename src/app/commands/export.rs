@@ -271,11 +271,12 @@ fn model_of(mesh: &TriangleMesh, results: &LocalizationResults) -> Result<Model>
             colors: colors[rows].to_vec(),
         });
     }
-    if let Some(truth) = truth {
+    for rows in stretches(&results.has_truth().unwrap_or_default()) {
+        let path = &truth.unwrap_or_default()[rows];
         model.add_ribbon(&Ribbon {
             name: "true path",
-            path: truth,
-            colors: vec![TRUTH; truth.len()],
+            path,
+            colors: vec![TRUTH; path.len()],
         });
     }
     Ok(model)

@@ -57,11 +57,8 @@ impl MotionSource {
                 }
             }
             (OdometrySource::GroundTruth, _) => {
-                let poses = recording
-                    .frames
-                    .iter()
-                    .filter_map(|frame| frame.map_from_lidar);
-                let motions = motions(&poses.collect::<Vec<_>>());
+                let poses = recording.frames.iter().map(|frame| frame.map_from_lidar);
+                let motions = motions(&without_gaps(poses.collect()));
                 let increments: Vec<Pose2> = motions.iter().map(pose2_from_pose3).collect();
                 let noisy = with_noise(&increments, &demonstration_noise(), rng);
                 let moved = motions.iter().zip(&increments).zip(&noisy);
@@ -97,13 +94,8 @@ impl MotionSource {
             );
             return Ok(Self::of_scans(recording));
         }
-        let mut last = Pose3::identity();
         let poses = track.matched(&recording.frames, recording.has_times)?;
-        let known = poses.into_iter().map(|pose| {
-            last = pose.unwrap_or(last);
-            last
-        });
-        let motions = motions(&known.collect::<Vec<_>>());
+        let motions = motions(&without_gaps(poses));
         let increments: Vec<Pose2> = motions.iter().map(pose2_from_pose3).collect();
         Ok(Self::given(motions, &increments))
     }
@@ -173,6 +165,16 @@ impl FrameMotion {
             in_space: in_space.map(|(motion, next)| motion * next),
         }
     }
+}
+
+/// A pose per frame: where a frame has none, that of the frame before it, and before the first known one this one.
+fn without_gaps(poses: Vec<Option<Pose3>>) -> Vec<Pose3> {
+    let mut last = poses.iter().flatten().next().copied().unwrap_or_default();
+    let known = poses.into_iter().map(|pose| {
+        last = pose.unwrap_or(last);
+        last
+    });
+    known.collect()
 }
 
 /// Description of the odometry for reports.

@@ -11,6 +11,7 @@ use serde::Serialize;
 use super::motion_source;
 use super::motion_source::MotionSource;
 use super::stages::{RecordingInputs, input_files};
+use crate::app::report::results::unknown_pose;
 use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, Trajectory};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
 use crate::app::run::arguments::numbers;
@@ -130,7 +131,11 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let place = (&map, &sensor);
     let (refined, runtimes_s) = refine(config, context, place, frames, &starts, &increments)?;
     let truth = sequence.frames.iter().map(|frame| frame.map_from_lidar);
-    let truth: Option<Vec<Pose3>> = truth.collect();
+    let truth = truth.map(|pose| pose.unwrap_or_else(unknown_pose));
+    let truth = sequence
+        .track
+        .is_some()
+        .then(|| truth.collect::<Vec<Pose3>>());
     let planar = |truth: &[Pose3]| truth.iter().map(pose2_from_pose3).collect();
     results.ground_truth = (results.ground_truth.take()).or(truth.as_deref().map(planar));
     results.ground_truth_in_space = results

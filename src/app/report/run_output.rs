@@ -344,7 +344,8 @@ pub fn evaluate(
     about: BTreeMap<String, String>,
 ) -> Result<Report> {
     let estimates = results.estimates_or_particle_means(rules)?;
-    let truth_in_space = results.ground_truth_in_space.as_deref();
+    let evaluated = results.with_truth_only();
+    let truth_in_space = evaluated.ground_truth_in_space.as_deref();
     let report = |trajectory: &EvaluatedTrajectory, in_space: &Option<Column<Pose3>>| {
         let in_space = in_space.as_deref().zip(truth_in_space);
         if trajectory.trusted_after(skipped(trajectory)).is_empty() {
@@ -353,24 +354,24 @@ pub fn evaluate(
         evaluate_trajectory(trajectory, in_space, rules).map(Some)
     };
     let (mut mcl, mut refined) = (None, None);
-    if let Some(ground_truth) = results.ground_truth.as_deref() {
-        let tracked = results.tracked();
+    if let Some(ground_truth) = evaluated.ground_truth.as_deref() {
+        let tracked = evaluated.tracked();
         let of_filter = EvaluatedTrajectory {
-            estimates: &estimates,
+            estimates: &evaluated.estimates_or_particle_means(rules)?,
             ground_truth,
-            times_s: results.times_s.as_deref(),
-            runtimes_s: results.runtimes_s.as_deref(),
+            times_s: evaluated.times_s.as_deref(),
+            runtimes_s: evaluated.runtimes_s.as_deref(),
             trusted: tracked.as_deref(),
         };
-        mcl = report(&of_filter, &results.estimates_in_space)?;
-        if let Some(poses) = &results.refined {
+        mcl = report(&of_filter, &evaluated.estimates_in_space)?;
+        if let Some(poses) = &evaluated.refined {
             let of_refined = EvaluatedTrajectory {
                 estimates: poses,
-                runtimes_s: results.refine_runtimes_s.as_deref(),
-                trusted: Some(&results.refined_trusted()),
+                runtimes_s: evaluated.refine_runtimes_s.as_deref(),
+                trusted: Some(&evaluated.refined_trusted()),
                 ..of_filter
             };
-            refined = report(&of_refined, &results.refined_in_space)?;
+            refined = report(&of_refined, &evaluated.refined_in_space)?;
         }
     }
     let summary = RunSummary::of(results, &estimates);

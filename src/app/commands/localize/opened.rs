@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::iter;
 use std::path::Path;
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 
 use super::super::motion_source::MotionSource;
 use super::super::stages::{RecordingInputs, input_files};
@@ -12,7 +12,7 @@ use super::gnss_start;
 use crate::app::report::RunFiles;
 use crate::app::report::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES};
 use crate::app::run::{Claims, Context, Outputs, input};
-use crate::app::settings::{LocalizationConfig, NPZ, OdometrySource};
+use crate::app::settings::{Initialization, LocalizationConfig, NPZ, OdometrySource};
 use crate::file_path::FilePath;
 use crate::lidar::Scan;
 use crate::map::Map;
@@ -64,6 +64,13 @@ pub fn open(
     let mut resolved = config.clone();
     let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
     gnss_start::resolve(&mut resolved, &map, &recording)?;
+    let first = recording.frames.first();
+    let is_at_truth =
+        resolved.initialization() == Initialization::Tracking && resolved.initial_pose.is_none();
+    ensure!(
+        !is_at_truth || first.is_some_and(|frame| frame.map_from_lidar.is_some()),
+        "pose_file has no pose of the first frame, at which pose_tracking starts; give initial_pose, or start_idx of a frame with a pose"
+    );
     let odometry = config.tracker.odometry.clone().unwrap_or_default();
     let recording = (config.inertial).open_calibrated(recording, &odometry, context)?;
     let mut rng = stream(config.tracker.seed, ODOMETRY_STREAM);

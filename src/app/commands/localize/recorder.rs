@@ -12,7 +12,7 @@ use super::opened::Opened;
 
 use crate::app::report::LocalizationResults;
 use crate::app::report::results::{
-    Column, LiveSummary, ParticleLog, ResultWriter, RowLog, ScanOutline,
+    Column, LiveSummary, ParticleLog, ResultWriter, RowLog, ScanOutline, unknown_pose,
 };
 use crate::app::report::run_output::{self, Movie};
 use crate::app::run::{Claims, Interrupted};
@@ -138,10 +138,9 @@ impl Run {
         results.particles.push_frame(&particles)?;
         self.off_ground += usize::from(!estimate.on_mapped_ground);
         push(&mut results.estimates, estimate.pose);
-        if let Some(truth) = &frame.map_from_lidar {
-            push(&mut results.ground_truth, pose2_from_pose3(truth));
-            push(&mut results.ground_truth_in_space, *truth);
-        }
+        let truth = frame.map_from_lidar.unwrap_or_else(unknown_pose);
+        push(&mut results.ground_truth, pose2_from_pose3(&truth));
+        push(&mut results.ground_truth_in_space, truth);
         push(
             &mut results.odometry,
             increment.unwrap_or_else(Pose2::identity),

@@ -173,11 +173,11 @@ impl Trajectories {
             let refined = odometry(&refined[row], covariance, of_refined(row), stamp);
             log.send("/refined", stamp, &refined)?;
         }
-        if let Some(truth) = &self.truth {
+        if let Some(truth) = self.truth_of(row) {
             let truth = PoseInFrame {
                 timestamp: timestamp(stamp),
                 frame_id: MAP.to_owned(),
-                pose: Some(pose(&truth[row])),
+                pose: Some(pose(truth)),
             };
             log.send("/truth", stamp, &truth)?;
         }
@@ -192,9 +192,15 @@ impl Trajectories {
         log.send_json("/numbers", stamp, &self.numbers(results, row, state(row)))
     }
 
+    /// The true pose of a frame, where it is known.
+    fn truth_of(&self, row: usize) -> Option<&Pose3> {
+        let truth = &self.truth.as_ref()?[row];
+        (!truth.translation.x.is_nan()).then_some(truth)
+    }
+
     fn numbers(&self, results: &LocalizationResults, row: usize, state: Option<&str>) -> Value {
         let errors = |poses: &[Pose3]| {
-            let [pose, truth] = [&poses[row], &self.truth.as_ref()?[row]].map(pose2_from_pose3);
+            let [pose, truth] = [&poses[row], self.truth_of(row)?].map(pose2_from_pose3);
             planar_errors(&[pose], &[truth]).first().copied()
         };
         let best = pose2_from_pose3(&self.best()[row]);
@@ -231,7 +237,7 @@ impl Trajectories {
             ..LinePrimitive::default()
         };
         let estimate = results.trajectory_in_space().unwrap_or(&self.estimates);
-        let all = vec![true; results.len()];
+        let all = results.has_truth().unwrap_or_default();
         let lines = [
             ("truth", TRUTH, self.truth.as_ref(), all),
             ("estimate", MCL, Some(estimate), results.trusted()),

@@ -19,7 +19,7 @@ function interactive(figure) {
   }
   const largest = run.errors_cm && Math.max(...run.errors_cm, 0.01);
   const color = (k) => {
-    if (!run.errors_cm) return run.states ? run.state_colors[run.states[k]] : run.color;
+    if (run.errors_cm?.[k] == null) return run.states ? run.state_colors[run.states[k]] : run.color;
     const last = run.colormap.length - 1;
     return run.colormap[Math.min(last, Math.floor((run.errors_cm[k] / largest) * (last + 1)))];
   };
@@ -31,7 +31,8 @@ function interactive(figure) {
     let [left, right, low, high] = [Infinity, -Infinity, Infinity, -Infinity];
     // Poses that are not trusted are no part of the path.
     const trusted = run.poses.filter((_, k) => isTrusted(Math.floor(k / 3)));
-    for (const poses of trusted.length ? [trusted, run.truth ?? []] : [run.truth ?? run.poses])
+    const truth = run.truth?.filter((number) => number !== null);
+    for (const poses of trusted.length ? [trusted, truth ?? []] : [truth ?? run.poses])
       for (let k = 0; k < poses.length / 3; k++) {
         const { x, y } = at(poses, k);
         [left, right] = [Math.min(left, x), Math.max(right, x)];
@@ -65,7 +66,7 @@ function interactive(figure) {
       ink.drawImage(image, x, y, image.width * scale, image.height * scale);
     }
     ink.lineCap = "round";
-    if (run.truth) trace(run.truth, 5, () => run.truth_color);
+    if (run.truth) trace(run.truth, 5, () => run.truth_color, (k) => run.truth[3 * k] !== null);
     trace(run.poses, 3, color, isTrusted);
     const pose = at(run.poses, frame);
     const [sine, cosine] = [Math.sin(pose.heading), Math.cos(pose.heading)];
@@ -97,7 +98,7 @@ function interactive(figure) {
     if (run.times_s) parts.push(`${(run.times_s[frame] - run.times_s[0]).toFixed(1)} s`);
     if (run.states) parts.push(run.states[frame]);
     if (run.places && run.places[frame] > 1) parts.push(`one of ${run.places[frame]} places`);
-    if (run.errors_cm)
+    if (run.errors_cm?.[frame] != null)
       parts.push(`${run.errors_cm[frame].toFixed(1)} cm and ${run.heading_errors_deg[frame].toFixed(3)} deg off`);
     if (run.sigmas_cm) parts.push(`standard deviation ${run.sigmas_cm[frame].toFixed(1)} cm`);
     if (run.agreements && run.agreements[frame] >= 0)

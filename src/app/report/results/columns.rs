@@ -235,10 +235,20 @@ impl Row<7> for Pose3 {
 
     /// The rotation of a row of zeros is the identity.
     fn from_row([x, y, z, i, j, k, w]: [f64; 7]) -> Option<Self> {
+        if x.is_nan() {
+            return Some(unknown_pose());
+        }
         let rotation = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), f64::MIN_POSITIVE);
         let translation = Translation3::new(x, y, z);
         Some(Self::from_parts(translation, rotation.unwrap_or_default()))
     }
+}
+
+/// A pose that is not known, such as the true one of a frame without a truth: no number of its row is one.
+pub fn unknown_pose() -> Pose3 {
+    let rotation = Quaternion::new(f64::NAN, f64::NAN, f64::NAN, f64::NAN);
+    let translation = Translation3::new(f64::NAN, f64::NAN, f64::NAN);
+    Pose3::from_parts(translation, UnitQuaternion::new_unchecked(rotation))
 }
 
 /// Row-major.

@@ -6,7 +6,7 @@ use anyhow::Result;
 use nalgebra::Matrix3;
 
 use super::localization_results::LocalizationResults;
-use super::trusted::{trusted_distances_m, with_gaps};
+use super::trusted::with_gaps;
 use crate::app::run::output;
 use crate::evaluation::trust::Axes;
 use crate::evaluation::{PlanarError, drift};
@@ -39,8 +39,8 @@ fn write_localization(
     let refined = results.refined.as_deref();
     let covariances = results.covariances.as_deref();
     let (trajectory, trusted) = (results.trajectory(estimates), results.trusted());
-    let driven_m = truth.map_or_else(|| trusted_distances_m(&trajectory, &trusted), distances_m);
     let trajectory = with_gaps(&trajectory, &trusted);
+    let driven_m = distances_m(truth.unwrap_or(&trajectory));
     let word = |&number: &u8| {
         State::from_number(number).map_or_else(|| number.to_string(), |it| it.word().to_owned())
     };

@@ -21,7 +21,7 @@
 //! | `times_are_assumed` | () | int64 | 1; only where `times_s` are not recorded: ten frames per second are assumed |
 //!
 //! All but the first three are optional, and so are `particles` where there are `frames`: a trajectory without a map.
-//! They are NaN in rows before `start_idx`.
+//! They are NaN in rows before `start_idx`, and the ground truth in those of frames without a true pose.
 
 use std::borrow::Cow;
 use std::io;
@@ -164,7 +164,7 @@ pub struct LocalizationResults {
     pub estimates: Option<Column<Pose2>>,
     /// The refined trajectory.
     pub refined: Option<Column<Pose2>>,
-    /// The ground truth.
+    /// The ground truth; not a number where a frame has no true pose.
     pub ground_truth: Option<Column<Pose2>>,
     /// The filter's estimates in space, `map_from_lidar`.
     pub estimates_in_space: Option<Column<Pose3>>,

@@ -22,7 +22,7 @@ mod run_summary;
 #[cfg(test)]
 pub(crate) mod kitti_07_tests;
 
-pub use columns::Column;
+pub use columns::{Column, unknown_pose};
 pub use frames::{FrameTable, write_frames_csv};
 pub use live_summary::{LatencySummary, LiveSummary};
 pub use localization_results::{LocalizationResults, ParticleLog, ScanOutline};

@@ -124,6 +124,19 @@ impl Array<'_> {
     /// for the message.
     pub fn next_finite_row<const N: usize>(&mut self, row: usize) -> Result<[f64; N]> {
         let numbers = self.next_row()?;
+        self.finite(row, numbers)
+    }
+
+    /// As [`next_finite_row`](Self::next_finite_row), of a row that may be unknown: then no number of it is one.
+    pub fn next_row_or_unknown<const N: usize>(&mut self, row: usize) -> Result<[f64; N]> {
+        let numbers: [f64; N] = self.next_row()?;
+        if numbers.iter().all(|number| number.is_nan()) {
+            return Ok(numbers);
+        }
+        self.finite(row, numbers)
+    }
+
+    fn finite<const N: usize>(&self, row: usize, numbers: [f64; N]) -> Result<[f64; N]> {
         let is_invalid = |number: &&f64| !number.is_finite() || number.abs() > LARGEST;
         match numbers.iter().find(is_invalid) {
             Some(&value) => Err(not_valid(self.path, self.name, row, value)),

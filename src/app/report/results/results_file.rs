@@ -279,7 +279,7 @@ struct RowReader<'a> {
 }
 
 impl RowReader<'_> {
-    /// Reads an array of finite numbers, a row per item. `None` if it is missing, or empty, which means the
+    /// Reads an array of finite numbers, or unknown true poses, a row per item. `None` if it is missing, or empty, which means the
     /// same in range-mcl.
     fn column<T: Row<N> + Pod, const N: usize>(
         &mut self,
@@ -299,8 +299,14 @@ impl RowReader<'_> {
         for _ in 0..self.first {
             array.next_row::<N>()?;
         }
+        // Not every frame has a true pose.
+        let may_be_unknown = name.starts_with("ground_truth");
         let item = |row| {
-            let numbers = array.next_finite_row(row)?;
+            let numbers = if may_be_unknown {
+                array.next_row_or_unknown(row)?
+            } else {
+                array.next_finite_row(row)?
+            };
             T::from_row(numbers).ok_or_else(|| not_valid(self.path, name, row, numbers[0]))
         };
         let items: Result<_> = (self.first..self.rows).map(item).collect();

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 use super::columns::Column;
 use super::localization_results::LocalizationResults;
 use super::rows::{MetricRow, length, metrics};
-use super::trusted::trusted_distances_m;
+use super::trusted::with_gaps;
 use crate::evaluation::Summary;
-use crate::geometry::Pose2;
+use crate::geometry::{Pose2, distances_m};
 use crate::localization::particles::long_axis_m;
 
 /// States, uncertainty and agreement with the map over the frames of a run.
@@ -96,7 +96,7 @@ impl RunSummary {
             Summary::new(&values)
         };
         let covariance = |row: usize| Some(trajectory.covariances?[row]);
-        let path_m = trusted_distances_m(trajectory.poses, trusted)
+        let path_m = distances_m(&with_gaps(trajectory.poses, trusted))
             .last()
             .copied()
             .unwrap_or_default();

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::ops::Range;
 
-use super::columns::Column;
+use super::columns::{Column, unknown_pose};
 use super::localization_results::LocalizationResults;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::localization::State;
@@ -63,6 +63,29 @@ impl LocalizationResults {
         }
     }
 
+    /// Whether each frame has a true pose; `None` where no truth was given.
+    pub fn has_truth(&self) -> Option<Vec<bool>> {
+        let planar = self.ground_truth.as_deref();
+        let in_space = self.ground_truth_in_space.as_deref();
+        let is_known = |row: usize| {
+            planar.is_none_or(|all| !all[row].translation.x.is_nan())
+                && in_space.is_none_or(|all| !all[row].translation.x.is_nan())
+        };
+        let is_given = planar.is_some() || in_space.is_some();
+        is_given.then(|| (0..self.len()).map(is_known).collect())
+    }
+
+    /// The results of the frames that can be evaluated: those with a true pose, where a truth was given.
+    pub fn with_truth_only(&self) -> Cow<'_, Self> {
+        match self.has_truth() {
+            Some(known) if known.contains(&false) => {
+                let rows: Vec<usize> = (0..known.len()).filter(|&row| known[row]).collect();
+                Cow::Owned(self.select(&rows))
+            }
+            _ => Cow::Borrowed(self),
+        }
+    }
+
     fn tracking(&self, states: Option<&Column<u8>>) -> Vec<bool> {
         let is_tracking = |&state: &u8| state == State::Tracking as u8;
         states.map_or_else(
@@ -83,7 +106,7 @@ impl LocalizationResults {
 
 /// Poses of which those that are not trusted are gaps: not a number, which pictures leave out.
 pub fn with_gaps(poses: &[Pose2], trusted: &[bool]) -> Vec<Pose2> {
-    let gap = Pose2::new([f64::NAN; 2].into(), f64::NAN);
+    let gap = pose2_from_pose3(&unknown_pose());
     (poses.iter().zip(trusted))
         .map(|(pose, &is_trusted)| if is_trusted { *pose } else { gap })
         .collect()
@@ -98,35 +121,17 @@ pub fn stretches(trusted: &[bool]) -> impl Iterator<Item = Range<usize>> {
     all.into_iter()
 }
 
-/// Distance driven up to each pose [m]: along the trusted ones, and across gaps by the straight line.
-pub fn trusted_distances_m(poses: &[Pose2], trusted: &[bool]) -> Vec<f64> {
-    let mut previous: Option<&Pose2> = None;
-    let mut driven_m = 0.0;
-    (poses.iter().zip(trusted))
-        .map(|(pose, is_trusted)| {
-            if *is_trusted {
-                let step = |it: &Pose2| (pose.translation.vector - it.translation.vector).norm();
-                driven_m += previous.map_or(0.0, step);
-                previous = Some(pose);
-            }
-            driven_m
-        })
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::distances_m;
 
     #[test]
     fn a_gap_is_bridged_by_a_straight_line_and_what_is_before_the_first_trusted_pose_is_no_way() {
         let poses = [100.0, 1.0, 2.0, -70.0, 5.0, 80.0].map(|x| Pose2::translation(x, 0.0));
         let trusted = [false, true, true, false, true, false];
-        assert_eq!(
-            trusted_distances_m(&poses, &trusted),
-            [0.0, 0.0, 1.0, 1.0, 4.0, 4.0]
-        );
         let with_gaps = with_gaps(&poses, &trusted);
+        assert_eq!(distances_m(&with_gaps), [0.0, 0.0, 1.0, 1.0, 4.0, 4.0]);
         for (pose, is_trusted) in with_gaps.iter().zip(trusted) {
             let numbers = [pose.translation.x, pose.rotation.angle()];
             assert_eq!(numbers.map(|it| !it.is_nan()), [is_trusted; 2]);

@@ -265,7 +265,11 @@ impl<'a> Drawing<'a> {
             self.results.estimates_in_space.as_deref(),
             self.results.refined_in_space.as_deref(),
         );
-        let [of_filter, of_refined] = [self.tracked(), self.results.refined_trusted()];
+        let known = self.results.has_truth().unwrap_or_default();
+        let [of_filter, of_refined] =
+            [self.tracked(), self.results.refined_trusted()].map(|trusted| -> Vec<bool> {
+                trusted.iter().zip(&known).map(|(a, b)| a & b).collect()
+            });
         let trajectories = [
             (
                 self.name,
