@@ -4,6 +4,7 @@
 //! evaluation script. Everything here works on values; files are read and written elsewhere.
 
 pub(crate) mod alignment;
+mod consistency;
 pub(crate) mod convergence;
 pub(crate) mod drift;
 mod ground_score;
@@ -20,6 +21,7 @@ mod surface_distance;
 pub(crate) mod trust;
 
 pub use alignment::{Alignment, aligned};
+pub use consistency::Consistency;
 pub use convergence::{Convergence, StrictSuccess};
 pub use ground_score::{GroundProtocol, GroundScore, LabelledPoints};
 pub use metrics::{

@@ -5,13 +5,14 @@
 //! ```text
 //! wrong       |e| > 0.5 m and tracking              right but unsure   |e| ≤ 0.5 m and not tracking
 //! to notice   longest time wrong and tracking       to recover         longest time not tracking after the first
-//! inside      share of tracking frames with  eᵀ Σ⁻¹ e ≤ 7.815,  e = (x, y, heading),   95 % of χ² with 3 degrees
+//! inside      share of tracking frames inside the 95 % region of their covariance: consistency
 //! ```
 
 use nalgebra::{Matrix2, Matrix3};
 use serde::{Deserialize, Serialize};
 
-use super::planar::{PlanarError, planar_errors};
+use super::consistency::is_inside;
+use super::planar::planar_errors;
 use crate::geometry::Pose2;
 use crate::statistics::median;
 
@@ -132,13 +133,6 @@ impl Axes {
             long_from_forward_rad: along.dot(&forward).abs().min(1.0).acos(),
         }
     }
-}
-
-fn is_inside(error: &PlanarError, covariance: &Matrix3<f64>) -> bool {
-    const QUANTILE: f64 = 7.815;
-    let error = error.offset_in_map.push(error.turn_rad);
-    let inverse = covariance.try_inverse();
-    inverse.is_some_and(|inverse| error.dot(&(inverse * error)) <= QUANTILE)
 }
 
 /// Longest time during which successive frames meet a condition, up to the frame after the last of them [s].

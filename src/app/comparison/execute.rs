@@ -260,14 +260,20 @@ fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
     let results = LocalizationResults::read(result)?
         .with_truth_only()
         .into_owned();
-    let (poses, in_space, refinement_s) = if is_refined {
+    let (poses, in_space, covariances, refinement_s) = if is_refined {
         (
             results.refined,
             results.refined_in_space,
+            results.refined_covariances,
             results.refine_runtimes_s,
         )
     } else {
-        (results.estimates, results.estimates_in_space, None)
+        (
+            results.estimates,
+            results.estimates_in_space,
+            results.covariances,
+            None,
+        )
     };
     let (poses, truth) = poses
         .zip(results.ground_truth)
@@ -290,7 +296,8 @@ fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
     let in_space = in_space
         .as_deref()
         .zip(results.ground_truth_in_space.as_deref());
-    run_output::evaluate_trajectory(&trajectory, in_space, &RangeMclRules::default())
+    let (covariances, rules) = (covariances.as_deref(), RangeMclRules::default());
+    run_output::evaluate_trajectory(&trajectory, in_space, covariances, &rules)
 }
 
 /// Trust in the states of the filter; `None` where the result lacks what it needs.

@@ -31,6 +31,7 @@ fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecor
         range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
         metrics: TrajectoryMetrics::new(&trajectory, &MetricsConfig::default()).unwrap(),
         in_space: None,
+        consistency: None,
     };
     RunRecord {
         id: RunId {

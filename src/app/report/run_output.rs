@@ -7,6 +7,7 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
+use nalgebra::Matrix3;
 
 use crate::app::report::results::{
     Column, LocalizationResults, RefinementSummary, Report, RunSummary, TrajectoryReport,
@@ -16,8 +17,8 @@ use crate::app::run::{Claims, Outputs, output};
 use crate::app::settings::{InertialConfig, MapInputConfig, RecordingConfig};
 use crate::evaluation::metrics::pick;
 use crate::evaluation::{
-    EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, SpatialMetrics,
-    TrajectoryMetrics,
+    Consistency, EvaluatedTrajectory, MetricsConfig, ParticleRow, PlanarError, RangeMclRules,
+    SpatialMetrics, TrajectoryMetrics,
 };
 use crate::files::folder_of;
 use crate::geometry::{Pose2, Pose3, StampedPose};
@@ -346,12 +347,14 @@ pub fn evaluate(
     let estimates = results.estimates_or_particle_means(rules)?;
     let evaluated = results.with_truth_only();
     let truth_in_space = evaluated.ground_truth_in_space.as_deref();
-    let report = |trajectory: &EvaluatedTrajectory, in_space: &Option<Column<Pose3>>| {
+    let report = |trajectory: &EvaluatedTrajectory,
+                  in_space: &Option<Column<Pose3>>,
+                  covariances: &Option<Column<Matrix3<f64>>>| {
         let in_space = in_space.as_deref().zip(truth_in_space);
         if trajectory.trusted_after(skipped(trajectory)).is_empty() {
             return Ok(None);
         }
-        evaluate_trajectory(trajectory, in_space, rules).map(Some)
+        evaluate_trajectory(trajectory, in_space, covariances.as_deref(), rules).map(Some)
     };
     let (mut mcl, mut refined) = (None, None);
     if let Some(ground_truth) = evaluated.ground_truth.as_deref() {
@@ -363,7 +366,11 @@ pub fn evaluate(
             runtimes_s: evaluated.runtimes_s.as_deref(),
             trusted: tracked.as_deref(),
         };
-        mcl = report(&of_filter, &evaluated.estimates_in_space)?;
+        mcl = report(
+            &of_filter,
+            &evaluated.estimates_in_space,
+            &evaluated.covariances,
+        )?;
         if let Some(poses) = &evaluated.refined {
             let of_refined = EvaluatedTrajectory {
                 estimates: poses,
@@ -371,7 +378,11 @@ pub fn evaluate(
                 trusted: Some(&evaluated.refined_trusted()),
                 ..of_filter
             };
-            refined = report(&of_refined, &evaluated.refined_in_space)?;
+            refined = report(
+                &of_refined,
+                &evaluated.refined_in_space,
+                &evaluated.refined_covariances,
+            )?;
         }
     }
     let summary = RunSummary::of(results, &estimates);
@@ -395,6 +406,7 @@ pub fn evaluate(
 pub fn evaluate_trajectory(
     trajectory: &EvaluatedTrajectory,
     in_space: Option<(&[Pose3], &[Pose3])>,
+    covariances: Option<&[Matrix3<f64>]>,
     rules: &RangeMclRules,
 ) -> Result<TrajectoryReport> {
     let config = MetricsConfig {
@@ -402,7 +414,14 @@ pub fn evaluate_trajectory(
         ..MetricsConfig::default()
     };
     let rows = trajectory.trusted_after(config.skip_frames);
+    let error = |row: usize| {
+        PlanarError::between(&trajectory.estimates[row], &trajectory.ground_truth[row])
+    };
+    let consistency = covariances.and_then(|covariances| {
+        Consistency::new(rows.iter().map(|&row| (error(row), &covariances[row])))
+    });
     Ok(TrajectoryReport {
+        consistency,
         range_mcl: rules.evaluate(trajectory.estimates, trajectory.ground_truth),
         metrics: TrajectoryMetrics::new(trajectory, &config)?,
         in_space: in_space.and_then(|(estimates, truth)| {

@@ -184,18 +184,20 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
     let truth = results.ground_truth.clone().unwrap_or_default();
     let truth_in_space = results.ground_truth_in_space.clone();
     let [of_filter, of_refined] = [results.trusted(), results.refined_trusted()];
-    for (trusted, poses, in_space, trajectory) in [
+    for (trusted, poses, in_space, trajectory, covariances) in [
         (
             of_filter,
             &mut results.estimates,
             &mut results.estimates_in_space,
             &mut results.trajectory_in_space,
+            &mut results.covariances,
         ),
         (
             of_refined,
             &mut results.refined,
             &mut results.refined_in_space,
             &mut None,
+            &mut results.refined_covariances,
         ),
     ] {
         let transform = |estimates: &[Pose3], truth: &[Pose3]| {
@@ -212,6 +214,11 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
         let transform = transform.context(
             "the positions are on a straight line, which determines no rigid alignment; set alignment to first",
         )?;
+        let turn = pose2_from_pose3(&transform).rotation;
+        let turn = turn.to_rotation_matrix().to_homogeneous();
+        for covariance in covariances.iter_mut().flatten() {
+            *covariance = turn * *covariance * turn.transpose();
+        }
         if let Some(trajectory) = trajectory {
             *trajectory = aligned(&transform, trajectory).into();
         }

@@ -9,10 +9,10 @@ use serde::{Deserialize, Serialize};
 
 use super::live_summary::LiveSummary;
 use super::refinement_summary::RefinementSummary;
-use super::rows::{MetricRow, Value, length, metric_rows, metrics, spatial_rows};
+use super::rows::{MetricRow, Value, consistency_rows, length, metric_rows, metrics, spatial_rows};
 use super::run_summary::RunSummary;
 use crate::app::run::visible::visible_in_line;
-use crate::evaluation::{RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
+use crate::evaluation::{Consistency, RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
 
 /// The most important rows of a run without true poses. A report of every kind has at most twelve such rows.
 const MAIN_OF_RUN: [&str; 6] = [
@@ -65,6 +65,9 @@ pub struct TrajectoryReport {
     /// Errors in six degrees of freedom, where the poses in space are known.
     #[serde(default)]
     pub in_space: Option<SpatialMetrics>,
+    /// Errors against the covariances of the poses, where these are known.
+    #[serde(default)]
+    pub consistency: Option<Consistency>,
 }
 
 impl TrajectoryReport {
@@ -77,7 +80,8 @@ impl TrajectoryReport {
             "range-mcl RMSE yaw" ["deg"] errors.rmse_yaw_deg, "heading RMSE from row convergence_interval on, as range-mcl computes it, over all frames";
         };
         let in_space = self.in_space.as_ref().map_or_else(Vec::new, spatial_rows);
-        [range_mcl, metric_rows(&self.metrics), in_space].concat()
+        let consistency = consistency_rows(self.consistency.as_ref());
+        [range_mcl, metric_rows(&self.metrics), consistency, in_space].concat()
     }
 }
 
@@ -342,6 +346,7 @@ mod tests {
             range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
             metrics: TrajectoryMetrics::new(&trajectory, &MetricsConfig::default()).unwrap(),
             in_space: None,
+            consistency: None,
         }
     }
 

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::evaluation::{SpatialMetrics, Summary, TrajectoryMetrics};
+use crate::evaluation::{Consistency, SpatialMetrics, Summary, TrajectoryMetrics};
 
 /// The value of a metric.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -113,6 +113,17 @@ pub fn metric_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
         runtime_rows(metrics),
     ]
     .concat()
+}
+
+/// The rows of errors against their covariances; the same rows where these are not known.
+pub fn consistency_rows(found: Option<&Consistency>) -> Vec<MetricRow> {
+    let mean = |number: fn(&Consistency) -> f64| found.map(number);
+    metrics! {
+        "normalized squared error" [""] mean(|it| it.squared_error), "mean of eᵀ Σ⁻¹ e, e: error of x, y and heading, Σ: its covariance; 3 where the errors are as large as the covariances say, more where they are larger";
+        "normalized squared error, long axis" [""] mean(|it| it.squared_error_long), "the same along the long axis of the covariance of the position; 1 is expected";
+        "normalized squared error, short axis" [""] mean(|it| it.squared_error_short), "the same along the short axis; 1 is expected";
+        "inside the 95 % region" ["%"] mean(|it| 100.0 * it.inside), "share of the frames with eᵀ Σ⁻¹ e of at most 7.815, the 95 % quantile of χ² with 3 degrees of freedom";
+    }
 }
 
 /// The rows of the errors in six degrees of freedom.
