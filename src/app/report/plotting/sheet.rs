@@ -98,8 +98,8 @@ impl Sheet<'_> {
         Ok(())
     }
 
-    /// Draws a dashed line through points, clipped to a rectangle; `on` and `off` are the lengths
-    /// of dashes and gaps.
+    /// Draws a dashed line through points, clipped to a rectangle, with a gap where one is not finite; `on` and `off` are the
+    /// lengths of dashes and gaps.
     pub fn dashes(
         &self,
         points: &[Point],
@@ -111,6 +111,9 @@ impl Sheet<'_> {
         for pair in points.windows(2) {
             let (from, to) = (pair[0], pair[1]);
             let length = f64::hypot(to.0 - from.0, to.1 - from.1);
+            if !length.is_finite() {
+                continue;
+            }
             let at = |distance: f64| {
                 let share = distance / length.max(1e-9);
                 (
