@@ -1,7 +1,8 @@
 """A node of ROS 2 that localizes clouds in a map: python ros2_node.py MAP.ply [--ros-args -r points:=/velodyne_points].
 
-It needs rclpy of ROS 2 and its messages. `fpmcl live --ros2` does the same and more without ROS; this is a start for a node of
-one's own: subscribe, step, publish.
+It needs rclpy of ROS 2 with tf2_ros, its messages, and SciPy. `fpmcl live --ros2` does the same and more without ROS; this is a
+start for a node of one's own: subscribe, step, publish. It publishes the transform from `map` to the parameter `base_frame`. Where
+somebody publishes the robot in `odom`, publish from `map` to `odom` instead: map_from_base @ inv(odom_from_base).
 """
 
 import sys
@@ -12,19 +13,22 @@ import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
 from sensor_msgs_py.point_cloud2 import read_points
-from tf2_ros import TransformBroadcaster
+from tf2_ros import Buffer, TransformBroadcaster, TransformException, TransformListener
 
 
 class Localization(Node):
-    """Publishes the pose of each cloud, and the transform from the map to it while it is tracked."""
+    """Publishes the pose of the robot at each cloud, and the transform from the map to it, while it is tracked."""
 
     def __init__(self, map_file):
         super().__init__("fpmcl_localization")
+        self.base_frame = self.declare_parameter("base_frame", "base_link").value
         self.localizer = fpmcl.Localizer(fpmcl.Map.load(map_file, cache=True))
         self.poses = self.create_publisher(PoseWithCovarianceStamped, "pose", 10)
-        self.transforms = TransformBroadcaster(self)
+        self.transforms, self.known = TransformBroadcaster(self), Buffer()
+        self.listener = TransformListener(self.known, self)
         self.create_subscription(PointCloud2, "points", self.localize, qos_profile_sensor_data)
 
     def localize(self, cloud):
@@ -33,40 +37,37 @@ class Localization(Node):
         stamp = cloud.header.stamp
         try:
             estimate = self.localizer.step(points, time=stamp.sec + 1e-9 * stamp.nanosec)
-        except fpmcl.Error as error:
-            self.get_logger().warning(f"a cloud is left out: {error}")
+            mounting = self.known.lookup_transform(self.base_frame, cloud.header.frame_id, rclpy.time.Time()).transform
+        except (fpmcl.Error, TransformException) as error:
+            self.get_logger().warning(f"a cloud has no pose: {error}", throttle_duration_sec=1.0)
             return
         if estimate.state != "tracking":
             self.get_logger().info(f"{estimate.state}: {estimate.places} places", throttle_duration_sec=1.0)
             return
-        transform = TransformStamped()
+        transform = TransformStamped(child_frame_id=self.base_frame)
         transform.header.stamp, transform.header.frame_id = stamp, "map"
-        transform.child_frame_id = cloud.header.frame_id
-        position = estimate.map_from_lidar[:3, 3]
-        (transform.transform.translation.x, transform.transform.translation.y, transform.transform.translation.z) = position
-        rotation = transform.transform.rotation
-        rotation.x, rotation.y, rotation.z, rotation.w = quaternion(estimate.map_from_lidar[:3, :3])
+        map_from_base = estimate.map_from_lidar @ np.linalg.inv(matrix(mounting))
+        t, q = transform.transform.translation, transform.transform.rotation
+        t.x, t.y, t.z = map_from_base[:3, 3].tolist()
+        q.x, q.y, q.z, q.w = Rotation.from_matrix(map_from_base[:3, :3]).as_quat().tolist()
         self.transforms.sendTransform(transform)
 
         message = PoseWithCovarianceStamped(header=transform.header)
-        message.pose.pose.orientation = rotation
-        (message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.position.z) = position
-        # Rows and columns of x, y and heading.
-        covariance = np.zeros((6, 6))
+        position, message.pose.pose.orientation = message.pose.pose.position, q
+        position.x, position.y, position.z = t.x, t.y, t.z
+        # Rows and columns of x, y and heading, those of the lidar; -1 is not known.
+        covariance = -np.eye(6)
         covariance[np.ix_([0, 1, 5], [0, 1, 5])] = estimate.covariance
         message.pose.covariance = covariance.ravel().tolist()
         self.poses.publish(message)
 
 
-def quaternion(rotation):
-    """x, y, z, w of a rotation."""
-    w = 0.5 * np.sqrt(max(0.0, 1.0 + np.trace(rotation)))
-    if w < 1e-6:
-        # Half a turn: the axis is the column that the rotation leaves largest.
-        axis = (rotation + np.eye(3))[:, np.argmax(np.diag(rotation))]
-        return *(axis / np.linalg.norm(axis)), 0.0
-    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    return *(axis / (4.0 * w)), w
+def matrix(transform):
+    """A transform as a matrix, (4, 4)."""
+    t, q = transform.translation, transform.rotation
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z]
+    return pose
 
 
 if __name__ == "__main__":
