@@ -1,5 +1,6 @@
 //! `live --ros2`: clouds that a robot sends by Cyclone DDS, and what it receives. In a network namespace of their own, where the
-//! loopback is the only interface.
+//! loopback is the only interface. Without Cyclone DDS or such a namespace they say that they did not run, unless
+//! `FPMCL_REQUIRE_ROS2=1`.
 
 #![cfg(all(target_os = "linux", feature = "ros2"))]
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
@@ -21,6 +22,18 @@ const FIRST_S: f64 = 1.0;
 /// Runs a program in a network namespace, whose interpreter is given as `$PYTHON`.
 const IN_NAMESPACE: &str = "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo && exec \"$@\"";
 
+/// Whether a scenario that cannot run is a failure.
+fn is_required() -> bool {
+    std::env::var_os("FPMCL_REQUIRE_ROS2").is_some_and(|value| value == "1")
+}
+
+/// Reports that a scenario does not run; where they are required it fails.
+#[track_caller]
+fn skipped(reason: &str) {
+    assert!(!is_required(), "FPMCL_REQUIRE_ROS2=1, but {reason}");
+    common::skips::skipped(reason);
+}
+
 /// A street with its map, whose frames have the times of the robot.
 fn street() -> Recording {
     let recording = Recording::street(12);
@@ -39,12 +52,12 @@ fn in_namespace() -> Command {
 /// Runs a scenario of the robot; `None`, with a message, where what it needs is missing.
 fn robot(recording: &Recording, scenario: &str, arguments: &[&str]) -> Option<Value> {
     let Some(python) = common::python_with("cyclonedds", "ros2") else {
-        common::skips::skipped("FPMCL_PYTHON names no interpreter with cyclonedds");
+        skipped("FPMCL_PYTHON names no interpreter with cyclonedds");
         return None;
     };
     let probe = in_namespace().args(["true"]).output();
     if !probe.is_ok_and(|it| it.status.success()) {
-        common::skips::skipped("this machine makes no network namespace (unshare, ip)");
+        skipped("this machine makes no network namespace (unshare, ip)");
         return None;
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/ros2/robot.py");
