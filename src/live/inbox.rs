@@ -58,7 +58,11 @@ impl<T> Inbox<T> {
 
     /// Adds a scan that arrives now.
     pub fn push(&self, scan: T) {
-        let arrived = Instant::now();
+        self.push_arrived(scan, Instant::now());
+    }
+
+    /// Adds a scan that arrived before, and was decoded since then.
+    pub fn push_arrived(&self, scan: T, arrived: Instant) {
         let mut content = self.content();
         content.received += 1;
         content.waiting.push_back(Arrival { scan, arrived });
@@ -163,6 +167,15 @@ mod tests {
         inbox.push(3);
         inbox.put_back(first);
         assert_eq!((taken(&inbox), inbox.dropped()), (vec![2, 3], 1));
+    }
+
+    #[test]
+    fn the_arrival_is_that_of_the_message_and_not_that_of_the_decoded_scan() {
+        let inbox = Inbox::new(1);
+        let arrived = Instant::now();
+        inbox.push_arrived(5, arrived);
+        let expected = Received::Scan(Arrival { scan: 5, arrived });
+        assert_eq!(inbox.take(Duration::ZERO), expected);
     }
 
     #[test]
