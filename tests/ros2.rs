@@ -348,6 +348,19 @@ fn what_a_robot_cannot_have_is_an_error_before_any_work() {
         .rejects_usage_with(&["cannot be used with"]);
     live().with("--domain=300").rejects_usage_with(&["0..=232"]);
     live()
+        .with("--interface=::1")
+        .rejects_usage_with(&["an IPv4 address of this machine"]);
+    // An address for documentation (RFC 5737).
+    live()
+        .with("--interface=192.0.2.1")
+        .fails_with(&["no network interface of this machine has this address"]);
+    live()
+        .with("--remap=/fpmcl/poses:=/pose")
+        .fails_with(&["no topic /fpmcl/poses is used", "/fpmcl/pose,"]);
+    live()
+        .environment("ROS_DOMAIN_ID", "300")
+        .fails_with(&["ROS_DOMAIN_ID is 300; set a number from 0 to 232"]);
+    live()
         .with("--remap=/a")
         .rejects_usage_with(&["/fpmcl/pose:=/pose"]);
 }

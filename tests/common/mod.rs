@@ -54,6 +54,12 @@ impl Fpmcl {
         self
     }
 
+    /// Sets a variable of the environment.
+    pub fn environment(mut self, name: &str, value: &str) -> Self {
+        self.command.env(name, value);
+        self
+    }
+
     /// Overrides a key of the configuration.
     pub fn set(self, key: &str, value: &str) -> Self {
         self.with("--set").with(format!("{key}={value}"))

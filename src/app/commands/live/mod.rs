@@ -175,7 +175,7 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
     }
     let topic = args.ros2.topic.as_deref();
     if let Some(topic) = topic {
-        check_topic(topic, config)?;
+        check_topic(topic, &args.ros2, config)?;
     }
     let last = match args.start {
         Some(LiveStart::Last) => last_pose::read(config)?,
@@ -256,12 +256,12 @@ fn claim_log(log: &Path, config: &LocalizationConfig, context: &Context) -> Resu
 
 /// Requires that the clouds of a topic can be localized.
 #[cfg(feature = "ros2")]
-fn check_topic(_topic: &str, config: &LocalizationConfig) -> Result<()> {
-    ros2::check(config)
+fn check_topic(_topic: &str, args: &Ros2Args, config: &LocalizationConfig) -> Result<()> {
+    ros2::check(args, config)
 }
 
 #[cfg(not(feature = "ros2"))]
-fn check_topic(topic: &str, _config: &LocalizationConfig) -> Result<()> {
+fn check_topic(topic: &str, _args: &Ros2Args, _config: &LocalizationConfig) -> Result<()> {
     bail!(
         "--ros2 {topic}: this program was built without ROS 2; build it with --features ros2, or replay a recording with --replay RECORDING"
     );

@@ -1,9 +1,20 @@
 //! Arguments of a node of ROS 2.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv4Addr, UdpSocket};
 
-use anyhow::{Result, ensure};
-use clap::Args;
+use anyhow::{Result, bail, ensure};
+use clap::{Args, ValueEnum};
+
+/// Topics that every node names alike.
+pub const TRANSFORMS: &str = "/tf";
+pub const STATIC_TRANSFORMS: &str = "/tf_static";
+pub const PROPOSALS: &str = "/initialpose";
+pub const DIAGNOSTICS: &str = "/diagnostics";
+
+/// Topics that are named after the node.
+pub const POSE: &str = "pose";
+pub const ODOMETRY: &str = "odometry";
+pub const MAP: &str = "map";
 
 /// Topics, frames and networks of ROS 2.
 #[derive(Clone, Debug, Args)]
@@ -16,9 +27,17 @@ pub struct Ros2Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
     pub domain: Option<u16>,
 
-    /// Address of this machine in the network of ROS 2; by default all, or what ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_LOCALHOST_ONLY allow.
-    #[arg(long, value_name = "IP")]
-    pub interface: Option<IpAddr>,
+    /// IPv4 address of this machine in the network of ROS 2; by default all, or what ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_LOCALHOST_ONLY allow.
+    #[arg(long, value_name = "IP", value_parser = interface)]
+    pub interface: Option<Ipv4Addr>,
+
+    /// Name of the node, before its own topics such as /fpmcl/pose, and in its diagnostics; another one for each robot of a domain.
+    #[arg(long, value_name = "NAME", default_value = "fpmcl", value_parser = node_name)]
+    pub node_name: String,
+
+    /// Whether clouds that are lost are sent again.
+    #[arg(long, value_enum, default_value_t = Reliability::BestEffort)]
+    pub reliability: Reliability,
 
     /// Show the node in `ros2 node list` of Iron and later; nodes of Humble in the same domain misread this message, and may crash.
     #[arg(long)]
@@ -41,7 +60,52 @@ pub struct Ros2Args {
     pub remap: Vec<(String, String)>,
 }
 
+/// Delivery of the clouds, with the names of ROS 2.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[value(rename_all = "snake_case")]
+pub enum Reliability {
+    /// Lost clouds are sent again; only a sender that is reliable, too, is heard.
+    Reliable,
+    /// Lost clouds are not sent again, so that a late one delays no other.
+    BestEffort,
+}
+
 impl Ros2Args {
+    /// The name of a topic of the node, before remapping.
+    pub fn own_topic(&self, name: &str) -> String {
+        format!("/{}/{name}", self.node_name)
+    }
+
+    /// Requires that each topic that is remapped is one of those that are used, with that of odometry.
+    pub fn check_remappings(&self, odometry: Option<&str>) -> Result<()> {
+        let own = [POSE, ODOMETRY, MAP].map(|name| self.own_topic(name));
+        let given = self.topic.as_deref().into_iter().chain(odometry);
+        let common = [TRANSFORMS, STATIC_TRANSFORMS, PROPOSALS, DIAGNOSTICS];
+        let own = own.iter().map(String::as_str);
+        let known: Vec<&str> = given.chain(common).chain(own).collect();
+        let unknown = |(from, _): &&(String, String)| !known.contains(&from.as_str());
+        if let Some((from, to)) = self.remap.iter().find(unknown) {
+            bail!(
+                "--remap {from}:={to}, but no topic {from} is used; give one of {}",
+                known.join(", ")
+            );
+        }
+        Ok(())
+    }
+
+    /// Requires that the interface is one of this machine: DDS would leave out another one without a word.
+    pub fn check_interface(&self) -> Result<()> {
+        if let Some(address) = self.interface {
+            // Of the loopback only its first address is that of an interface.
+            let is_of_interface = !address.is_loopback() || address == Ipv4Addr::LOCALHOST;
+            ensure!(
+                is_of_interface && UdpSocket::bind((address, 0)).is_ok(),
+                "--interface is {address}, but no network interface of this machine has this address; give one of those that `ip -4 address` prints"
+            );
+        }
+        Ok(())
+    }
+
     /// The name of a topic after remapping.
     pub fn remapped<'a>(&'a self, topic: &'a str) -> &'a str {
         let found = self.remap.iter().find(|(from, _)| from == topic);
@@ -74,7 +138,7 @@ impl Ros2Args {
             "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so that no topic is found; set it to LOCALHOST or SUBNET, or give --interface IP"
         );
         Ok(match self.interface {
-            Some(interface) => Some(vec![interface]),
+            Some(interface) => Some(vec![interface.into()]),
             None if range == Some("LOCALHOST") || is_local_only == Some("1") => {
                 Some(vec![IpAddr::from([127, 0, 0, 1])])
             }
@@ -95,6 +159,21 @@ pub(super) fn topic(text: &str) -> Result<String, &'static str> {
         Ok(format!("/{absolute}"))
     } else {
         Err("give the name of a topic, such as /points")
+    }
+}
+
+fn interface(text: &str) -> Result<Ipv4Addr, &'static str> {
+    let address = text.parse::<Ipv4Addr>().ok();
+    let is_of_machine =
+        |it: &Ipv4Addr| !(it.is_unspecified() || it.is_multicast() || it.is_broadcast());
+    (address.filter(is_of_machine))
+        .ok_or("give an IPv4 address of this machine, such as 192.168.1.5")
+}
+
+fn node_name(text: &str) -> Result<String, &'static str> {
+    match topic(text) {
+        Ok(name) if name[1..] == *text && !text.contains('/') => Ok(text.to_owned()),
+        _ => Err("give the name of a node, such as fpmcl_front"),
     }
 }
 
@@ -124,9 +203,13 @@ mod tests {
         ros2: Ros2Args,
     }
 
-    fn arguments(words: &[&str]) -> Ros2Args {
+    fn parsed(words: &[&str]) -> Result<Ros2Args, clap::Error> {
         let words = ["live"].iter().chain(words);
-        Arguments::try_parse_from(words).unwrap().ros2
+        Ok(Arguments::try_parse_from(words)?.ros2)
+    }
+
+    fn arguments(words: &[&str]) -> Ros2Args {
+        parsed(words).unwrap()
     }
 
     #[test]
@@ -160,6 +243,82 @@ mod tests {
         assert_eq!(ros2.remapped("/fpmcl/map"), "/fpmcl/map");
         for wrong in ["", "/", "/a//b", "/1", "/a b", "/é"] {
             assert!(topic(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_topic_that_is_remapped_is_one_that_is_used() {
+        let remapping = |from: &str, more: &[&str]| {
+            let remap = format!("--remap={from}:=/other");
+            let words: Vec<&str> = ["--ros2=/points", &remap]
+                .iter()
+                .chain(more)
+                .copied()
+                .collect();
+            arguments(&words).check_remappings(Some("/odom"))
+        };
+        for known in [
+            "/points",
+            "/odom",
+            "/tf",
+            "/tf_static",
+            "/initialpose",
+            "/diagnostics",
+        ] {
+            remapping(known, &[]).unwrap();
+        }
+        for own in ["pose", "odometry", "map"] {
+            remapping(&format!("/fpmcl/{own}"), &[]).unwrap();
+            remapping(&format!("/front/{own}"), &["--node-name=front"]).unwrap();
+        }
+        for (unknown, more) in [
+            ("/fpmcl/poses", &[][..]),
+            ("/fpmcl/pose", &["--node-name=front"][..]),
+        ] {
+            let error = remapping(unknown, more).unwrap_err().to_string();
+            assert!(
+                error.contains(unknown) && error.contains("/tf_static"),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_node_has_one_name_and_the_delivery_of_clouds_those_of_ros() {
+        assert_eq!(
+            arguments(&["--node-name=front_2"]).own_topic("pose"),
+            "/front_2/pose"
+        );
+        for wrong in [
+            "--node-name=a/b",
+            "--node-name=/a",
+            "--node-name=",
+            "--reliability=best-effort",
+        ] {
+            assert!(parsed(&[wrong]).is_err(), "{wrong}");
+        }
+        assert_eq!(arguments(&[]).reliability, Reliability::BestEffort);
+        let asked = arguments(&["--reliability=reliable"]);
+        assert_eq!(asked.reliability, Reliability::Reliable);
+    }
+
+    #[test]
+    fn an_interface_is_an_address_of_this_machine() {
+        arguments(&[]).check_interface().unwrap();
+        arguments(&["--interface=127.0.0.1"])
+            .check_interface()
+            .unwrap();
+        // The first is for documentation (RFC 5737).
+        for elsewhere in ["192.0.2.1", "127.0.0.2"] {
+            let given = arguments(&[&format!("--interface={elsewhere}")]);
+            let error = given.check_interface().unwrap_err().to_string();
+            assert!(error.contains(elsewhere), "{error}");
+        }
+        for wrong in ["::1", "0.0.0.0", "239.255.0.1", "eth0"] {
+            assert!(
+                parsed(&[&format!("--interface={wrong}")]).is_err(),
+                "{wrong}"
+            );
         }
     }
 }

@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 use std::env;
 use std::iter;
+use std::net::IpAddr;
 use std::path::Path;
 
 use anyhow::{Result, bail};
@@ -20,11 +21,12 @@ use crate::app::report::run_output;
 use crate::app::settings::{LocalizationConfig, OdometrySource};
 use crate::localization::Start;
 
-/// Name of the node.
-const NAME: &str = "fpmcl";
-
-/// Requires that a configuration asks for nothing that only a recording has.
-pub fn check(config: &LocalizationConfig) -> Result<()> {
+/// Requires that the arguments and the variables of ROS 2 fit together and to this machine, and that a configuration asks for
+/// nothing that only a recording has.
+pub fn check(args: &Ros2Args, config: &LocalizationConfig) -> Result<()> {
+    domain_and_networks(args)?;
+    args.check_interface()?;
+    args.check_remappings(odometry_topic(config).as_deref())?;
     if let Some(poses) = &config.given_poses.pose_file {
         bail!(
             "pose_file is {}, but a robot that drives has no true poses; set pose_file to null, and the start by --start X,Y,HEADING",
@@ -52,6 +54,16 @@ pub fn check(config: &LocalizationConfig) -> Result<()> {
     Ok(())
 }
 
+/// The domain, and the addresses of its networks, `None` for all.
+fn domain_and_networks(args: &Ros2Args) -> Result<(u16, Option<Vec<IpAddr>>)> {
+    let variable = |name: &str| env::var(name).ok();
+    let domain = args.domain(variable("ROS_DOMAIN_ID").as_deref())?;
+    let range = variable("ROS_AUTOMATIC_DISCOVERY_RANGE");
+    let is_local_only = variable("ROS_LOCALHOST_ONLY");
+    let networks = args.networks(range.as_deref(), is_local_only.as_deref())?;
+    Ok((domain, networks))
+}
+
 /// The topic that is given as the file of odometry; `None` if it is no name of a topic.
 fn odometry_topic(config: &LocalizationConfig) -> Option<String> {
     let file = config
@@ -72,20 +84,14 @@ pub fn drive(
     sinks: Sinks,
 ) -> Result<()> {
     let config = &drive.opened.config;
-    let variable = |name: &str| env::var(name).ok();
-    let domain = args.domain(variable("ROS_DOMAIN_ID").as_deref())?;
-    let (range, is_local_only) = (
-        variable("ROS_AUTOMATIC_DISCOVERY_RANGE"),
-        variable("ROS_LOCALHOST_ONLY"),
-    );
-    let networks = args.networks(range.as_deref(), is_local_only.as_deref())?;
+    let (domain, networks) = domain_and_networks(args)?;
     let odometry = match config.motion.odometry {
         OdometrySource::Auto | OdometrySource::File => odometry_topic(config),
         _ => None,
     };
     let odometry = odometry.as_deref();
     let shared = Shared::new(&args.map_frame, &args.base_frame);
-    let mut node = Node::open(NAME, domain, networks)?;
+    let mut node = Node::open(&args.node_name, domain, networks)?;
     let receiver = Receiver::new(
         &mut node,
         args,
@@ -98,7 +104,8 @@ pub fn drive(
         node.announce()?;
     }
     tracing::info!(
-        "node /{NAME} of ROS 2 in domain {domain} localizes the clouds of {}",
+        "node /{} of ROS 2 in domain {domain} localizes the clouds of {}",
+        args.node_name,
         args.remapped(clouds)
     );
     let mesh = run_output::map_around(&drive.opened.map, iter::empty())?;

@@ -51,7 +51,7 @@ impl Quality {
 
 /// A node.
 pub struct Node {
-    name: &'static str,
+    name: String,
     participant: DomainParticipant,
     publisher: Publisher,
     subscriber: Subscriber,
@@ -63,7 +63,7 @@ pub struct Node {
 
 impl Node {
     /// A node in a domain, in the networks of some addresses of this machine, or in all.
-    pub fn open(name: &'static str, domain: u16, networks: Option<Vec<IpAddr>>) -> Result<Self> {
+    pub fn open(name: &str, domain: u16, networks: Option<Vec<IpAddr>>) -> Result<Self> {
         let open = || {
             let mut builder = DomainParticipantBuilder::new(domain);
             if let Some(addresses) = networks {
@@ -75,7 +75,7 @@ impl Node {
             let participant = builder.build()?;
             let policies = Quality::Reliable.policies(1);
             anyhow::Ok(Self {
-                name,
+                name: name.to_owned(),
                 publisher: participant.create_publisher(&policies)?,
                 subscriber: participant.create_subscriber(&policies)?,
                 participant,
@@ -122,7 +122,7 @@ impl Node {
         let writer = self.raw_writer("ros_discovery_info", TYPE, policies)?;
         let mut info = Cdr::default().array(&self.participant.guid().to_bytes());
         // One node, in the topmost namespace.
-        info = info.u32(1).text("/").text(self.name);
+        info = info.u32(1).text("/").text(&self.name);
         for entities in [&self.readers, &self.writers] {
             info = info.u32(entities.len() as u32);
             info = entities
@@ -132,6 +132,12 @@ impl Node {
         writer.send(info);
         self.announcement = Some(writer);
         Ok(())
+    }
+
+    /// Whether a topic is one of those that the node names after itself.
+    pub fn owns(&self, topic: &str) -> bool {
+        let name = topic.strip_prefix('/').and_then(|it| it.split_once('/'));
+        name.is_some_and(|(name, _)| name == self.name)
     }
 
     /// Topics of a type that others offer or read.

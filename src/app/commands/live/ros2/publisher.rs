@@ -10,7 +10,7 @@ use anyhow::Result;
 use glam::Vec3;
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
-use super::arguments::Ros2Args;
+use super::arguments::{DIAGNOSTICS, MAP, ODOMETRY, POSE, Ros2Args, TRANSFORMS};
 use super::cdr::Cdr;
 use super::node::{Node, Quality, Writer};
 use super::shared::{Place, Shared};
@@ -22,7 +22,7 @@ use crate::live::{LiveState, Reason};
 use crate::localization::Estimate;
 
 /// Time between two diagnostics of the same state.
-const DIAGNOSTICS: Duration = Duration::from_secs(1);
+const DIAGNOSTICS_PERIOD: Duration = Duration::from_secs(1);
 
 /// Largest number of points of the map that is published, and their smallest spacing [m].
 const MOST_POINTS: f64 = 500_000.0;
@@ -41,6 +41,8 @@ pub struct Publisher<'a> {
     map: Writer,
     /// Time after a scan for which its transform is [s].
     tolerance_s: f64,
+    /// Name of the status in the diagnostics.
+    status_name: String,
     /// The reason of the last diagnostics, and when they were sent.
     last: Option<(Reason, Instant)>,
 }
@@ -52,29 +54,31 @@ impl<'a> Publisher<'a> {
             node.writer(args.remapped(topic), message_type, quality, depth)
         };
         let reliable = Quality::Reliable;
+        let own = |name| args.own_topic(name);
         Ok(Self {
             shared,
             pose: writer(
-                "/fpmcl/pose",
+                &own(POSE),
                 "geometry_msgs/msg/PoseWithCovarianceStamped",
                 reliable,
                 DEPTH,
             )?,
-            odometry: writer("/fpmcl/odometry", "nav_msgs/msg/Odometry", reliable, DEPTH)?,
-            transforms: writer("/tf", "tf2_msgs/msg/TFMessage", reliable, DEPTH)?,
+            odometry: writer(&own(ODOMETRY), "nav_msgs/msg/Odometry", reliable, DEPTH)?,
+            transforms: writer(TRANSFORMS, "tf2_msgs/msg/TFMessage", reliable, DEPTH)?,
             diagnostics: writer(
-                "/diagnostics",
+                DIAGNOSTICS,
                 "diagnostic_msgs/msg/DiagnosticArray",
                 reliable,
                 DEPTH,
             )?,
             map: writer(
-                "/fpmcl/map",
+                &own(MAP),
                 "sensor_msgs/msg/PointCloud2",
                 Quality::Latched,
                 1,
             )?,
             tolerance_s: args.transform_tolerance,
+            status_name: format!("{}: localization", args.node_name),
             last: None,
         })
     }
@@ -171,7 +175,7 @@ impl<'a> Publisher<'a> {
         values: &[(&str, &dyn std::fmt::Display)],
     ) {
         let is_recent =
-            |(last, at): &(Reason, Instant)| *last == reason && at.elapsed() < DIAGNOSTICS;
+            |(last, at): &(Reason, Instant)| *last == reason && at.elapsed() < DIAGNOSTICS_PERIOD;
         if self.last.as_ref().is_some_and(is_recent) {
             return;
         }
@@ -186,10 +190,7 @@ impl<'a> Publisher<'a> {
         ]);
         all.extend(values);
         let array = Cdr::with_header(stamp_ns, "").u32(1).u8(level(state));
-        let status = array
-            .text("fpmcl: localization")
-            .text(&message)
-            .text("fpmcl");
+        let status = array.text(&self.status_name).text(&message).text("fpmcl");
         self.diagnostics.send(status.values(&all));
     }
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
-use super::arguments::Ros2Args;
+use super::arguments::{PROPOSALS, Reliability, Ros2Args, STATIC_TRANSFORMS, TRANSFORMS};
 use super::node::{Node, Quality, Reader, waker};
 use super::shared::Shared;
 use crate::app::commands::live::driving::now_ns;
@@ -36,6 +36,8 @@ const ODOMETRY: &str = "nav_msgs/msg/Odometry";
 /// The topics that are read.
 pub struct Receiver {
     clouds: Reader,
+    /// Whether only those of reliable senders arrive.
+    are_reliable: bool,
     cloud_watch: Watch,
     odometry: Option<(Reader, Watch)>,
     transforms: Reader,
@@ -111,7 +113,7 @@ impl Watch {
         let (topic, message_type) = (&self.topic, self.message_type);
         let of_others = node.other_types_of(topic, message_type);
         let mut others = node.topics_of(message_type);
-        others.retain(|it| it != topic && !it.starts_with("/fpmcl/"));
+        others.retain(|it| it != topic && !node.owns(it));
         let found = if let Some(other) = of_others.first() {
             format!("its type is {other} elsewhere")
         } else if others.is_empty() {
@@ -138,7 +140,11 @@ impl Receiver {
         let mut reader = |topic: &str, message_type: &str, quality, depth| {
             node.reader(args.remapped(topic), message_type, quality, depth)
         };
-        const TRANSFORMS: &str = "tf2_msgs/msg/TFMessage";
+        const TF_MESSAGE: &str = "tf2_msgs/msg/TFMessage";
+        let of_clouds = match args.reliability {
+            Reliability::Reliable => Quality::Reliable,
+            Reliability::BestEffort => Quality::BestEffort,
+        };
         let odometry = odometry
             .map(|topic| {
                 let watch = Watch::new(args.remapped(topic), ODOMETRY);
@@ -147,12 +153,13 @@ impl Receiver {
             .transpose()?;
         Ok(Self {
             cloud_watch: Watch::new(args.remapped(clouds), CLOUD),
-            clouds: reader(clouds, CLOUD, Quality::BestEffort, 5)?,
+            clouds: reader(clouds, CLOUD, of_clouds, 5)?,
+            are_reliable: of_clouds == Quality::Reliable,
             odometry,
-            transforms: reader("/tf", TRANSFORMS, Quality::BestEffort, 100)?,
-            static_transforms: reader("/tf_static", TRANSFORMS, Quality::Latched, 100)?,
+            transforms: reader(TRANSFORMS, TF_MESSAGE, Quality::BestEffort, 100)?,
+            static_transforms: reader(STATIC_TRANSFORMS, TF_MESSAGE, Quality::Latched, 100)?,
             proposals: reader(
-                "/initialpose",
+                PROPOSALS,
                 "geometry_msgs/msg/PoseWithCovarianceStamped",
                 Quality::Reliable,
                 1,
@@ -218,7 +225,12 @@ impl Receiver {
                     watch.check(node, ": the motion is that of the scans");
                 }
             } else {
-                self.cloud_watch.check(node, "");
+                let consequence = if self.are_reliable {
+                    ", reliably: --reliability best_effort hears all senders"
+                } else {
+                    ""
+                };
+                self.cloud_watch.check(node, consequence);
                 thread::park_timeout(POLL);
             }
         }
