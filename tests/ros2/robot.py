@@ -319,10 +319,10 @@ class Robot:
 
 
 class Wheeled(Robot):
-    """Its lidar is 1 m ahead of the base, whose odometry drifts sideways from (3, 0)."""
+    """Its lidar is 1 m ahead of the base, whose odometry begins at (2, 0) and has 2 % of the way too much ahead, 1 % sideways."""
 
-    def odom_x(self, frame):
-        return 3.0 + 0.5 * frame - 1.0
+    def pose_in_odom(self, frame):
+        return self.pose(2.0 + 0.51 * frame, 0.005 * frame)
 
     def place(self):
         mounting = TransformStamped(Header(stamp(0), "base_link"), "lidar", self.pose(1.0))
@@ -331,13 +331,17 @@ class Wheeled(Robot):
 
     def before(self, frame):
         # At the moment of the scan, and half a period later: that of the scan is known when it is received.
-        for half in range(2):
-            header = Header(stamp(self.moment(frame, half * self.PERIOD_NS // 2)), "odom")
-            pose = self.pose(self.odom_x(frame + 0.5 * half))
-            self.transforms.write(TFMessage([TransformStamped(header, "base_link", pose)]))
-            with_covariance = PoseWithCovariance(pose, [0.0] * 36)
-            still = TwistWithCovariance(Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), [0.0] * 36)
-            self.odometry.write(Odometry(header, "base_link", with_covariance, still))
+        for later in [0.0, 0.5]:
+            self.turn_wheels(frame + later)
+
+    def turn_wheels(self, frame):
+        """Sends transform and odometry of a moment between frames."""
+        header = Header(stamp(self.moment(0, int(frame * self.PERIOD_NS))), "odom")
+        pose = self.pose_in_odom(frame)
+        self.transforms.write(TFMessage([TransformStamped(header, "base_link", pose)]))
+        with_covariance = PoseWithCovariance(pose, [0.0] * 36)
+        still = TwistWithCovariance(Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), [0.0] * 36)
+        self.odometry.write(Odometry(header, "base_link", with_covariance, still))
 
 
 def drive(folder, receiver, _program):

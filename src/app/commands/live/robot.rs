@@ -11,8 +11,10 @@ use crate::recording::Frame;
 pub type ArrivedFrame = (Frame, Scan);
 
 /// A pose by the odometry of a robot.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct MeasuredPose {
+    /// Name of the frame in which it measures.
+    pub odom_frame: String,
     /// Pose of the frame that the odometry measures: `p_odom = odom_from_child * p_child`.
     pub odom_from_child: Pose3,
     /// Pose of the lidar in that frame at that time; `None` while no transforms connect the two.
@@ -21,12 +23,13 @@ pub struct MeasuredPose {
 
 impl MeasuredPose {
     /// Motion of the lidar since an earlier pose, `previous_from_current`; `None` where it is faster than a car, because the
-    /// odometry was reset.
+    /// odometry was reset, and between poses in two frames.
     pub fn since(&self, earlier: &Self, duration_s: f64) -> Option<Pose3> {
         /// Fastest motion [m/s].
         const FASTEST: f64 = 100.0;
         let moved = earlier.odom_from_child.inverse() * self.odom_from_child;
-        let is_possible = moved.translation.vector.norm() <= FASTEST * duration_s;
+        let is_possible = self.odom_frame == earlier.odom_frame
+            && moved.translation.vector.norm() <= FASTEST * duration_s;
         let [before, now] = match (earlier.child_from_lidar, self.child_from_lidar) {
             // The lidar may move on the robot.
             (Some(before), Some(now)) => [before, now],
@@ -71,6 +74,7 @@ mod tests {
     fn a_mounting_that_becomes_known_and_a_reset_of_the_odometry_are_no_motion() {
         let step = Pose3::translation(0.5, 0.0, 0.0);
         let pose = |odom_from_child: Pose3, child_from_lidar: Option<Pose3>| MeasuredPose {
+            odom_frame: "odom".to_owned(),
             odom_from_child,
             child_from_lidar,
         };
@@ -83,6 +87,11 @@ mod tests {
         assert_relative_eq!(moved, step, epsilon = 1e-12);
         let reset = pose(step, mounted.child_from_lidar);
         assert_eq!(reset.since(&mounted, 0.1), None);
+        let in_other_frame = MeasuredPose {
+            odom_frame: "odom_filtered".to_owned(),
+            ..mounted.clone()
+        };
+        assert_eq!(in_other_frame.since(&first, 0.1), None);
         // A mast that rises is one.
         let risen = pose(
             mounted.odom_from_child * step,

@@ -8,6 +8,7 @@ use super::recorder::Run;
 use crate::app::report::run_output::{self, REFINEMENT_FILES, Trajectory};
 use crate::app::report::{LocalizationResults, Report, run_page};
 use crate::app::run::{Context, output};
+use crate::app::settings::OdometrySource;
 use crate::evaluation::RangeMclRules;
 use crate::localization::State;
 
@@ -69,10 +70,13 @@ pub fn write_run(opened: &Opened, run: &mut Run, context: &Context) -> Result<Re
     warn_of_untracked_frames(results);
     let localizer = &config.tracker.localizer;
     let [most, reduced] = [localizer.num_particles, localizer.num_reduced];
-    let (odometry, seed) = (
-        motion_source::description(&config.motion),
-        config.tracker.seed,
-    );
+    let odometry = match (config.motion.odometry, &config.motion.odometry_file) {
+        (OdometrySource::Auto, None) if opened.is_driving() => {
+            "that of /tf, where it has any, else from the scans".to_owned()
+        }
+        _ => motion_source::description(&config.motion),
+    };
+    let seed = config.tracker.seed;
     let inputs = (&config.recording, &config.map_input);
     let mut about = run_output::about(results, inputs, map, odometry, seed);
     about.extend([

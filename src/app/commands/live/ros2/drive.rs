@@ -114,7 +114,11 @@ pub fn drive(
 
     let publisher = RefCell::new(publisher);
     let robot = Robot {
-        measured: Box::new(|time_s| odometry.and_then(|_| shared.measured(time_s))),
+        measured: Box::new(|time_s| match (odometry, config.motion.odometry) {
+            (Some(_), _) => shared.measured(time_s),
+            (None, OdometrySource::Auto) => shared.measured_by_transforms(time_s),
+            _ => None,
+        }),
         proposed: Box::new(|| shared.proposed()),
         localized: Box::new(|frame| publisher.borrow_mut().localized(frame)),
         waiting: Box::new(|time_s, reason| publisher.borrow_mut().waiting(time_s, reason)),

@@ -37,13 +37,16 @@ struct Known {
     frames: FrameTree,
     /// The frame above the robot that was reported.
     reported_top: Option<String>,
-    /// Poses of the topic of odometry, and the frame whose poses they are.
+    /// Poses of the topic of odometry, the frame that they are in, and the one whose poses they are.
     odometry: PoseBuffer,
+    odometry_parent: String,
     odometry_child: String,
     proposal: Option<(Pose3, [f64; 2])>,
     /// Numbers of clouds and their moments [ns].
     moments: VecDeque<(usize, u64)>,
     has_warned_of_mounting: bool,
+    /// Whether it was reported that the motion is that of the transforms.
+    has_reported_motion: bool,
 }
 
 /// What of the robot is known at a scan.
@@ -57,7 +60,7 @@ pub struct Place {
     pub top_frame: String,
     /// Pose of the child in it: `p_top = top.pose * p_child`.
     pub top: Relation,
-    /// The moment of the scan [ns].
+    /// The moment, that of a scan where it is known exactly [ns].
     pub moment_ns: u64,
 }
 
@@ -124,7 +127,7 @@ impl Shared {
         let mut known = self.known();
         for pose in poses {
             known.odometry.push(pose.time_s, pose.parent_from_child);
-            known.odometry_child = pose.child;
+            (known.odometry_parent, known.odometry_child) = (pose.parent, pose.child);
         }
     }
 
@@ -145,9 +148,31 @@ impl Shared {
             );
         }
         Some(MeasuredPose {
+            odom_frame: known.odometry_parent.clone(),
             odom_from_child,
             child_from_lidar,
         })
+    }
+
+    /// Pose by the moving transforms above the robot at a time [s]: where nobody sends a topic of odometry, `/tf` has the same.
+    pub fn measured_by_transforms(&self, time_s: f64) -> Option<MeasuredPose> {
+        let place = self.place_at(time_s)?;
+        if !place.top.is_moving {
+            return None;
+        }
+        let measured = MeasuredPose {
+            odom_from_child: place.top.pose?,
+            child_from_lidar: Some(place.child_from_lidar?),
+            odom_frame: place.top_frame,
+        };
+        if !std::mem::replace(&mut self.known().has_reported_motion, true) {
+            tracing::info!(
+                "the motion is that of {} in {}, by /tf",
+                place.child,
+                measured.odom_frame
+            );
+        }
+        Some(measured)
     }
 
     /// Takes a pose in the map that was proposed, with standard deviations of position [m] and heading [rad].
@@ -188,6 +213,17 @@ impl Shared {
 
     /// What is known at a cloud; `time_s` is its moment.
     pub fn place(&self, number: usize, time_s: f64) -> Option<Place> {
+        let place = self.place_at(time_s)?;
+        let known = self.known();
+        let moment = known.moments.iter().find(|it| it.0 == number);
+        Some(Place {
+            moment_ns: moment.map_or(place.moment_ns, |it| it.1),
+            ..place
+        })
+    }
+
+    /// What is known at a time [s].
+    pub fn place_at(&self, time_s: f64) -> Option<Place> {
         let mut known = self.known();
         let lidar = known.lidar_frame.clone()?;
         let base = &self.base_frame;
@@ -206,13 +242,12 @@ impl Shared {
             tracing::info!("the transform leads from {} to {top_frame}", self.map_frame);
             known.reported_top = Some(top_frame.clone());
         }
-        let moment = known.moments.iter().find(|it| it.0 == number);
         Some(Place {
             child,
             child_from_lidar,
             top_frame,
             top,
-            moment_ns: moment.map_or((1e9 * time_s) as u64, |it| it.1),
+            moment_ns: (1e9 * time_s) as u64,
         })
     }
 }
@@ -381,6 +416,32 @@ mod tests {
             ),
             ("lidar", "odom", None)
         );
+    }
+
+    #[test]
+    fn the_motion_is_that_of_the_transforms_above_the_robot_if_they_move() {
+        let shared = robot();
+        assert!(shared.measured_by_transforms(5.0).is_none());
+        // A mast moves, and the robot does not as far as is known.
+        let mast = Shared::new("map", "base_link");
+        mast.cloud(3, "lidar", 5_000_000_000);
+        mast.transforms(vec![transform("base_link", "lidar", 5.0, 2.0, 0.0)]);
+        assert!(mast.measured_by_transforms(5.0).is_none());
+        for (time_s, x, turn_rad) in [(5.0, 2.0, 0.0), (5.1, 3.0, 0.1)] {
+            shared.transforms(vec![transform("odom", "base_link", time_s, x, turn_rad)]);
+        }
+        let [first, last] = [5.0, 5.1].map(|it| shared.measured_by_transforms(it).unwrap());
+        assert_eq!(first.odom_frame, "odom");
+        // The lidar is 1 m ahead of the base, which turns.
+        let moved = last.since(&first, 0.1).unwrap().translation;
+        assert_relative_eq!(moved.x, 0.1_f64.cos(), epsilon = 1e-12);
+        assert_relative_eq!(moved.y, 0.1_f64.sin(), epsilon = 1e-12);
+        // Not known any more, and in another frame.
+        assert!(shared.measured_by_transforms(9.0).is_none());
+        shared.transforms(vec![transform("world", "odom", 5.1, 7.0, 0.0)]);
+        let other = shared.measured_by_transforms(5.1).unwrap();
+        assert_eq!(other.odom_frame, "world");
+        assert!(other.since(&first, 0.1).is_none());
     }
 
     #[test]
