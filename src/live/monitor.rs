@@ -32,8 +32,17 @@ const MISSING_SCANS: u32 = 2;
 pub struct LivePose {
     /// `p_map = map_from_lidar * p_lidar`, extrapolated to the moment that was asked for.
     pub map_from_lidar: Pose3,
-    /// Covariance of (x, y, heading) at the last scan [m², m·rad, rad²].
+    /// Covariance of (x, y, heading) at that moment [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
+}
+
+/// What a sensor sends while no scan of it is localized.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Silence {
+    /// No scan.
+    NoScan,
+    /// Scans that cannot be used: damaged, repeated, or of another sensor.
+    UnusableScans,
 }
 
 /// The last estimate while the pose is believed.
@@ -105,21 +114,34 @@ impl Monitor {
         }
     }
 
-    /// Notes that no scan has arrived for a time, of a sensor with a period; `moved` is the motion since the last scan, where
+    /// Notes that no scan was localized for a time, of a sensor with a period; `moved` is the motion since the last one, where
     /// it is measured.
-    pub fn wait(&mut self, waited: Duration, period: Duration, moved: Option<&Pose3>) {
+    pub fn wait(
+        &mut self,
+        silence: Silence,
+        waited: Duration,
+        period: Duration,
+        moved: Option<&Pose3>,
+    ) {
         if !self.state().is_believed() || waited <= (1 + MISSING_SCANS) * period {
             return;
         }
         let is_too_long = match moved {
-            Some(moved) => self.spread_after(moved) > self.limits.max_spread_m,
+            Some(moved) => (self.pose_after(moved))
+                .is_none_or(|after| spread(&after.covariance).0 > self.limits.max_spread_m),
             None => waited > LONGEST_COAST,
         };
-        self.set(if is_too_long {
-            Reason::StalledTooLong
-        } else {
-            Reason::SensorStalled
+        self.set(match (silence, is_too_long) {
+            (Silence::NoScan, false) => Reason::SensorStalled,
+            (Silence::NoScan, true) => Reason::StalledTooLong,
+            (Silence::UnusableScans, false) => Reason::ScansUnusable,
+            (Silence::UnusableScans, true) => Reason::UnusableTooLong,
         });
+    }
+
+    /// Whether no scan is localized, and the pose is believed: the motion carries it.
+    pub fn is_carried(&self) -> bool {
+        matches!(self.reason, Reason::SensorStalled | Reason::ScansUnusable)
     }
 
     /// `p_map = map_from_odom * p_odom` while the pose is believed.
@@ -133,17 +155,24 @@ impl Monitor {
         let believed = self.believed.as_ref()?;
         Some(LivePose {
             map_from_lidar: believed.map_from_lidar * moved,
-            covariance: believed.covariance,
+            covariance: self.covariance_after(believed, moved),
         })
     }
 
-    /// Spread of the position after a motion since the last scan [m].
-    fn spread_after(&self, moved: &Pose3) -> f64 {
-        let motion = TurnDriveTurn::decompose(&pose2_from_pose3(moved));
-        let before = self
-            .believed
-            .map_or_else(Matrix3::zeros, |it| it.covariance);
-        spread(&(before + self.noise.covariance(&motion))).0
+    /// Covariance of (x, y, heading) after a motion since the last scan: F P Fᵀ + R Q Rᵀ, where F moves the position across by
+    /// the heading, and R turns the noise Q of the motion into the axes of the map. Without a motion that of the scan.
+    fn covariance_after(&self, believed: &Believed, moved: &Pose3) -> Matrix3<f64> {
+        if *moved == Pose3::identity() {
+            return believed.covariance;
+        }
+        let before = pose2_from_pose3(&believed.map_from_lidar);
+        let motion = pose2_from_pose3(moved);
+        let step = before.rotation * motion.translation.vector;
+        let carry = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
+        let (sin, cos) = before.rotation.angle().sin_cos();
+        let turn = Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
+        let noise = self.noise.covariance(&TurnDriveTurn::decompose(&motion));
+        carry * believed.covariance * carry.transpose() + turn * noise * turn.transpose()
     }
 
     /// The reason of an estimate. A pose that was followed before and that the filter does not confirm is still followed:

@@ -103,7 +103,8 @@ fn a_pose_that_was_lost_is_not_believed_before_a_scan_confirms_it() {
 fn a_sensor_that_stalls_is_carried_by_the_motion_until_that_is_too_uncertain() {
     let after = |waited_s: f64, moved: Option<Pose3>| {
         let (mut monitor, _) = following();
-        monitor.wait(Duration::from_secs_f64(waited_s), PERIOD, moved.as_ref());
+        let waited = Duration::from_secs_f64(waited_s);
+        monitor.wait(Silence::NoScan, waited, PERIOD, moved.as_ref());
         monitor.reason()
     };
     // Two scans may be missing.
@@ -122,6 +123,42 @@ fn a_sensor_that_stalls_is_carried_by_the_motion_until_that_is_too_uncertain() {
 }
 
 #[test]
+fn scans_that_cannot_be_used_are_as_none_with_their_own_reason() {
+    let after = |waited_s: f64| {
+        let (mut monitor, _) = following();
+        let waited = Duration::from_secs_f64(waited_s);
+        monitor.wait(Silence::UnusableScans, waited, PERIOD, None);
+        (monitor.reason(), monitor.is_carried())
+    };
+    assert_eq!(after(0.3), (Reason::ScanAgrees, false));
+    assert_eq!(after(0.31), (Reason::ScansUnusable, true));
+    assert_eq!(after(1.11), (Reason::UnusableTooLong, false));
+}
+
+#[test]
+fn a_pose_that_is_carried_is_the_less_certain_the_farther_it_is_and_most_across_by_its_heading() {
+    let (monitor, _) = following();
+    let of = |x: f64| {
+        let moved = Pose3::translation(x, 0.0, 0.0);
+        monitor.pose_after(&moved).unwrap()
+    };
+    assert_eq!(of(0.0).covariance, Matrix3::from_diagonal_element(1e-4));
+    let spreads = [0.0, 1.0, 10.0, 100.0].map(|x| spread(&of(x).covariance).0);
+    assert!(spreads.is_sorted_by(|a, b| a < b), "{spreads:?}");
+    // Variances along and across the way: the heading moves the position across only.
+    let far = of(100.0);
+    let heading = pose2_from_pose3(&far.map_from_lidar).rotation;
+    let along = heading * nalgebra::Vector2::x();
+    let across = heading * nalgebra::Vector2::y();
+    let position = far.covariance.fixed_view::<2, 2>(0, 0).into_owned();
+    let variance = |axis: nalgebra::Vector2<f64>| (axis.transpose() * position * axis)[0];
+    let noise = OdometryNoise::default();
+    let drive_m = noise.drive_m.hypot(100.0 * noise.drive_per_m);
+    assert_relative_eq!(variance(along), 1e-4 + drive_m.powi(2), max_relative = 1e-2);
+    assert!(variance(across) > 1e-4 * 100.0_f64.powi(2));
+}
+
+#[test]
 fn waiting_changes_nothing_while_no_pose_is_believed() {
     for reason in Reason::ALL
         .into_iter()
@@ -129,7 +166,7 @@ fn waiting_changes_nothing_while_no_pose_is_believed() {
     {
         let (mut monitor, _) = following();
         monitor.set(reason);
-        monitor.wait(Duration::from_secs(9), PERIOD, None);
+        monitor.wait(Silence::NoScan, Duration::from_secs(9), PERIOD, None);
         assert_eq!(monitor.reason(), reason);
     }
 }

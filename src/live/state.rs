@@ -69,6 +69,8 @@ pub enum Reason {
     PositionImprecise,
     /// No scan arrives: the motion carries the pose.
     SensorStalled,
+    /// Scans arrive that cannot be used, such as repeated ones: the motion carries the pose.
+    ScansUnusable,
     /// The scan does not agree with the map.
     ScanDisagrees,
     /// The particles are scattered: nothing holds the pose.
@@ -77,11 +79,13 @@ pub enum Reason {
     NoPlaceFound,
     /// No scan arrived for too long.
     StalledTooLong,
+    /// No scan that can be used arrived for too long.
+    UnusableTooLong,
 }
 
 impl Reason {
     /// All reasons.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 15] = [
         Self::NoScan,
         Self::Preparing,
         Self::PositionUnknown,
@@ -91,10 +95,12 @@ impl Reason {
         Self::ScanAgrees,
         Self::PositionImprecise,
         Self::SensorStalled,
+        Self::ScansUnusable,
         Self::ScanDisagrees,
         Self::ParticlesScattered,
         Self::NoPlaceFound,
         Self::StalledTooLong,
+        Self::UnusableTooLong,
     ];
 
     /// The state to which the reason leads.
@@ -106,11 +112,14 @@ impl Reason {
             | Self::ClockJumped
             | Self::PoseProposed => LiveState::Searching,
             Self::ScanAgrees => LiveState::Tracking,
-            Self::PositionImprecise | Self::SensorStalled => LiveState::Coasting,
+            Self::PositionImprecise | Self::SensorStalled | Self::ScansUnusable => {
+                LiveState::Coasting
+            }
             Self::ScanDisagrees
             | Self::ParticlesScattered
             | Self::NoPlaceFound
-            | Self::StalledTooLong => LiveState::Lost,
+            | Self::StalledTooLong
+            | Self::UnusableTooLong => LiveState::Lost,
         }
     }
 
@@ -128,10 +137,14 @@ impl Reason {
                 "the scan does not determine the position; the motion carries it"
             }
             Self::SensorStalled => "no scan arrives; the motion carries the pose",
+            Self::ScansUnusable => {
+                "the scans that arrive cannot be used; the motion carries the pose"
+            }
             Self::ScanDisagrees => "the scan does not agree with the map",
             Self::ParticlesScattered => "nothing holds the pose: the particles are scattered",
             Self::NoPlaceFound => "no place was found that agrees with the scans",
             Self::StalledTooLong => "no scan arrived for too long",
+            Self::UnusableTooLong => "no scan that can be used arrived for too long",
         }
     }
 }

@@ -12,15 +12,15 @@ use super::super::localize::frame_tracker::FrameTracker;
 use super::super::localize::opened::Opened;
 use super::super::motion_source::{FrameMotion, MotionSource};
 use super::last_pose::LastPoseWriter;
-use super::robot::{ArrivedFrame, MeasuredPose, Robot};
+use super::robot::{ArrivedFrame, CarriedPose, MeasuredPose, Robot, Waiting};
 use crate::app::report::export::{LiveFrame, LiveLog, Sinks, live_log};
 use crate::app::report::results::{LatencySummary, LiveSummary};
 use crate::app::report::run_output;
 use crate::app::run::Context;
 use crate::geometry::{Pose3, pose3_from_pose2};
-use crate::lidar::Scan;
+use crate::lidar::Motion;
 use crate::live::{
-    Arrival, Inbox, Latencies, LiveState, Monitor, Reason, Received, StampClock, Tick,
+    Arrival, Inbox, Latencies, LiveState, Monitor, Reason, Received, Silence, StampClock, Tick,
 };
 use crate::localization::{LocalizerError, Start, TrackerError};
 
@@ -73,13 +73,18 @@ impl Drive<'_, '_> {
                 scope.spawn(move || writer.run(&mesh, first_s));
                 log
             });
-            let mut driver = Driver::new(self, tracker, is_prepared, log, robot);
-            let outcome = driver.follow(&inbox);
+            let reception = Reception {
+                inbox: &inbox,
+                unreadable: &unreadable,
+            };
+            let mut driver = Driver::new(self, reception, tracker, is_prepared, log, robot);
+            let outcome = driver.follow();
             // Nobody takes what the other thread would still send.
             inbox.close();
             outcome.map(|()| driver.summary())
         })?;
-        let rejected = summary.rejected + unreadable.load(Ordering::Relaxed);
+        let unreadable = unreadable.into_inner();
+        let rejected = summary.rejected + unreadable;
         let mut run = (self.recorded)();
         let dropped = inbox.dropped();
         run.missed = (dropped + rejected) as usize;
@@ -87,12 +92,18 @@ impl Drive<'_, '_> {
             run.results.selected = Some(run.results.len() + run.missed);
         }
         run.live = Some(LiveSummary {
-            received: inbox.received(),
+            received: inbox.received() + unreadable,
             dropped,
             rejected,
             ..summary
         });
         Ok(())
+    }
+
+    /// The time of the recording for a time that passes between two scans, so that a slow replay does not look like a stalled
+    /// sensor. In a fast replay, where reading the files may take longer, the time that passes.
+    fn recorded_time(&self, passed: Duration) -> Duration {
+        passed.mul_f64(self.rate.min(1.0))
     }
 }
 
@@ -107,9 +118,29 @@ fn now_s() -> f64 {
     1e-9 * now_ns() as f64
 }
 
+/// What the thread that receives has for the one that computes.
+#[derive(Clone, Copy)]
+struct Reception<'a> {
+    inbox: &'a Inbox<ArrivedFrame>,
+    /// Number of scans that could not be read.
+    unreadable: &'a AtomicU64,
+}
+
+/// The last scan that was localized.
+struct LastScan {
+    /// Its time [s].
+    time_s: f64,
+    arrived: Instant,
+    /// Time since the one before.
+    period: Option<Duration>,
+    /// Number of scans that could not be used until then.
+    rejected: u64,
+}
+
 /// The thread that computes.
 struct Driver<'a, 'b> {
     drive: &'a Drive<'a, 'b>,
+    reception: Reception<'a>,
     tracker: FrameTracker<'a>,
     monitor: Monitor,
     clock: StampClock,
@@ -122,15 +153,13 @@ struct Driver<'a, 'b> {
     summary: LiveSummary,
     /// Whether the map is prepared for the start.
     is_prepared: bool,
-    /// Time of the last scan [s], when it arrived, and the time since the one before.
-    last_s: f64,
-    last_arrival: Option<Instant>,
-    period: Option<Duration>,
+    last: Option<LastScan>,
 }
 
 impl<'a, 'b> Driver<'a, 'b> {
     fn new(
         drive: &'a Drive<'a, 'b>,
+        reception: Reception<'a>,
         tracker: FrameTracker<'a>,
         is_prepared: bool,
         log: Option<LiveLog>,
@@ -139,6 +168,7 @@ impl<'a, 'b> Driver<'a, 'b> {
         let config = &drive.opened.config;
         Self {
             drive,
+            reception,
             tracker,
             monitor: Monitor::new(&config.tracker.localizer),
             clock: StampClock::new(drive.rate),
@@ -149,14 +179,13 @@ impl<'a, 'b> Driver<'a, 'b> {
             measured_last: None,
             summary: LiveSummary::default(),
             is_prepared,
-            last_s: 0.0,
-            last_arrival: None,
-            period: None,
+            last: None,
         }
     }
 
     /// Takes scans until the last.
-    fn follow(&mut self, inbox: &Inbox<ArrivedFrame>) -> Result<()> {
+    fn follow(&mut self) -> Result<()> {
+        let inbox = self.reception.inbox;
         let context = self.drive.context;
         let frames = self.drive.opened.recording.frames.len();
         let task = (frames > 0).then(|| context.progress.task("live", frames));
@@ -166,13 +195,13 @@ impl<'a, 'b> Driver<'a, 'b> {
             }
             match inbox.take(WAIT) {
                 Received::End => break,
-                Received::Nothing => self.wait(),
+                Received::Nothing => self.wait(Instant::now()),
                 Received::Scan(arrival) if !self.is_prepared => {
-                    self.prepare(&arrival.scan.1)?;
+                    self.prepare(&arrival)?;
                     inbox.put_back(arrival);
                 }
                 Received::Scan(arrival) => {
-                    self.take(arrival, inbox.dropped())?;
+                    self.take(arrival)?;
                     let count = inbox.dropped() + self.summary.rejected + self.latencies.count();
                     if let Some(task) = &task {
                         task.set_share(count as f64 / frames as f64);
@@ -193,8 +222,9 @@ impl<'a, 'b> Driver<'a, 'b> {
     }
 
     /// Prepares the map for the sensor of the first scan.
-    fn prepare(&mut self, scan: &Scan) -> Result<()> {
-        self.note(Reason::Preparing);
+    fn prepare(&mut self, arrival: &Arrival<ArrivedFrame>) -> Result<()> {
+        let (frame, scan) = &arrival.scan;
+        self.note(Reason::Preparing, frame.time_s);
         self.is_prepared = true;
         match self.tracker.prepare_start(scan) {
             // What is wrong with this scan may be right with the next.
@@ -204,42 +234,44 @@ impl<'a, 'b> Driver<'a, 'b> {
     }
 
     /// Localizes a scan.
-    fn take(&mut self, arrival: Arrival<ArrivedFrame>, dropped: u64) -> Result<()> {
+    fn take(&mut self, arrival: Arrival<ArrivedFrame>) -> Result<()> {
         let Arrival {
             scan: (frame, scan),
             arrived,
         } = arrival;
-        self.period = self
-            .last_arrival
-            .map(|last| self.recorded_time(arrived.duration_since(last)));
-        (self.last_arrival, self.last_s) = (Some(arrived), frame.time_s);
         let stamp_s = scan.time_s.unwrap_or(frame.time_s);
         match self.clock.tick(stamp_s, arrived) {
             Tick::Later => {}
             Tick::Repeated => {
-                self.reject(&format!(
-                    "its time {stamp_s} s is not later than the last one"
-                ));
+                let why = format!("its time {stamp_s} s is not later than the last one");
+                self.reject(arrived, &why);
                 return Ok(());
             }
-            Tick::Jumped => self.restart(stamp_s)?,
+            Tick::Jumped => self.restart(frame.time_s)?,
         }
         let measured = (self.robot.measured)(frame.time_s);
         let motion = self.moved_to(frame.time_s, measured.as_ref());
         let motion = motion.map(FrameMotion::measured);
+        let rejected = self.rejected();
         let tracked = match self.tracker.step(&frame, &scan, motion) {
             Err(error) if error.downcast_ref().is_some_and(is_about_scan) => {
-                self.reject(&error.to_string());
+                self.reject(arrived, &error.to_string());
                 return Ok(());
             }
             tracked => tracked?,
         };
         self.measured_last = measured.map(|measured| (frame.time_s, measured));
+        let since = |last: &LastScan| arrived.saturating_duration_since(last.arrived);
+        let period = self.last.as_ref().map(since);
+        self.last = Some(LastScan {
+            time_s: frame.time_s,
+            arrived,
+            period: period.map(|period| self.drive.recorded_time(period)),
+            rejected,
+        });
         let before = self.monitor.reason();
         self.monitor
             .update(&tracked.estimate, &in_space(tracked.motion));
-        let latency = arrived.elapsed();
-        self.latencies.add(latency);
         let state = self.monitor.state();
         if let (LiveState::Tracking, Some(last_pose)) = (state, &mut self.last_pose) {
             last_pose.update(frame.time_s, &tracked.estimate.map_from_lidar);
@@ -252,15 +284,17 @@ impl<'a, 'b> Driver<'a, 'b> {
             scan,
             estimate,
             reason: self.monitor.reason(),
-            latency,
-            dropped,
+            latency: arrived.elapsed(),
+            dropped: self.reception.inbox.dropped(),
+            rejected,
         };
         (self.robot.localized)(&localized);
+        self.latencies.add(arrived.elapsed());
         (self.drive.recorded)().record(&frame, &localized.scan, &tracked)?;
         if let Some(log) = &mut self.log {
             log.frame(localized);
         }
-        self.note_change(before, Duration::ZERO);
+        self.note_change(before, frame.time_s);
         Ok(())
     }
 
@@ -270,26 +304,48 @@ impl<'a, 'b> Driver<'a, 'b> {
         measured?.since(last, time_s - last_s)
     }
 
-    /// The time of the recording for a time that passes between two scans, so that a slow replay does not look like a stalled
-    /// sensor. In a fast replay, where reading the files may take longer, the time that passes.
-    fn recorded_time(&self, passed: Duration) -> Duration {
-        passed.mul_f64(self.drive.rate.min(1.0))
+    /// Looks at the state at a moment at which no scan is localized.
+    fn wait(&mut self, now: Instant) {
+        let time_s = self.time_s(now);
+        let mut carried = None;
+        if let Some(last) = &self.last {
+            let waited = now.saturating_duration_since(last.arrived);
+            let waited = self.drive.recorded_time(waited);
+            let period = last.period.unwrap_or(USUAL_PERIOD).min(LONGEST_PERIOD);
+            let moved = self.moved_to(time_s, (self.robot.measured)(time_s).as_ref());
+            let silence = if self.rejected() > last.rejected {
+                Silence::UnusableScans
+            } else {
+                Silence::NoScan
+            };
+            let before = self.monitor.reason();
+            (self.monitor).wait(silence, waited, period, moved.as_ref());
+            let duration_s = time_s - last.time_s;
+            carried = moved.and_then(|moved| self.carried(moved, duration_s));
+            self.note_change(before, time_s);
+        }
+        let waiting = Waiting {
+            time_s,
+            reason: self.monitor.reason(),
+            carried,
+            dropped: self.reception.inbox.dropped(),
+            rejected: self.rejected(),
+        };
+        (self.robot.waiting)(&waiting);
     }
 
-    /// Looks at the state while no scan arrives.
-    fn wait(&mut self) {
-        let Some(last) = self.last_arrival else {
-            (self.robot.waiting)(now_s(), self.monitor.reason());
-            return;
-        };
-        let period = self.period.unwrap_or(USUAL_PERIOD).min(LONGEST_PERIOD);
-        let (before, waited) = (self.monitor.reason(), last.elapsed());
-        let now_s = self.last_s + self.drive.rate * waited.as_secs_f64();
-        let moved = self.moved_to(now_s, (self.robot.measured)(now_s).as_ref());
-        self.monitor
-            .wait(self.recorded_time(waited), period, moved.as_ref());
-        self.note_change(before, waited);
-        (self.robot.waiting)(now_s, self.monitor.reason());
+    /// The pose after a motion since the last scan, while that carries it.
+    fn carried(&self, moved: Pose3, duration_s: f64) -> Option<CarriedPose> {
+        if !self.monitor.is_carried() || duration_s <= 0.0 {
+            return None;
+        }
+        Some(CarriedPose {
+            pose: self.monitor.pose_after(&moved)?,
+            motion: Motion {
+                previous_from_current: moved,
+                duration_s,
+            },
+        })
     }
 
     /// Restarts at a proposed start, which the scans have to confirm.
@@ -308,14 +364,14 @@ impl<'a, 'b> Driver<'a, 'b> {
         }
         self.tracker.restart(start)?;
         (self.measured_last, self.is_prepared) = (None, true);
-        self.note(Reason::PoseProposed);
+        self.note(Reason::PoseProposed, self.time_s(Instant::now()));
         Ok(())
     }
 
     /// Begins again after the clock of the scans was set, around the pose that was believed.
-    fn restart(&mut self, stamp_s: f64) -> Result<()> {
+    fn restart(&mut self, time_s: f64) -> Result<()> {
         tracing::warn!(
-            "the clock of the scans jumped to {stamp_s} s: the localization begins again"
+            "the clock of the scans jumped to {time_s} s: the localization begins again"
         );
         let opened = self.drive.opened;
         let last = self.monitor.pose_after(&Pose3::identity());
@@ -325,26 +381,41 @@ impl<'a, 'b> Driver<'a, 'b> {
         );
         self.tracker.restart(start)?;
         self.measured_last = None;
-        self.note(Reason::ClockJumped);
+        self.note(Reason::ClockJumped, time_s);
         Ok(())
     }
 
-    fn reject(&mut self, why: &str) {
+    /// Leaves out a scan. A sensor all of whose scans are left out is as one that sends none.
+    fn reject(&mut self, arrived: Instant, why: &str) {
         if self.summary.rejected == 0 {
             tracing::warn!("a scan is left out: {why}");
         }
         self.summary.rejected += 1;
+        self.wait(arrived);
+    }
+
+    /// Number of scans that could not be used so far.
+    fn rejected(&self) -> u64 {
+        self.summary.rejected + self.reception.unreadable.load(Ordering::Relaxed)
+    }
+
+    /// A moment by the clock of the scans [s]; before the first one, by that of the machine.
+    fn time_s(&self, now: Instant) -> f64 {
+        self.last.as_ref().map_or_else(now_s, |last| {
+            let waited = now.saturating_duration_since(last.arrived);
+            last.time_s + self.drive.rate * waited.as_secs_f64()
+        })
     }
 
     /// Sets a reason that is not that of an estimate.
-    fn note(&mut self, reason: Reason) {
+    fn note(&mut self, reason: Reason, time_s: f64) {
         let before = self.monitor.reason();
         self.monitor.set(reason);
-        self.note_change(before, Duration::ZERO);
+        self.note_change(before, time_s);
     }
 
-    /// Reports a change of the state, some time after the last scan.
-    fn note_change(&mut self, before: Reason, waited: Duration) {
+    /// Reports a change of the state at a time [s].
+    fn note_change(&mut self, before: Reason, time_s: f64) {
         let (state, reason) = (self.monitor.state(), self.monitor.reason());
         if state == before.state() {
             return;
@@ -352,7 +423,6 @@ impl<'a, 'b> Driver<'a, 'b> {
         self.summary.changes += 1;
         tracing::info!("{}: {}", state.word(), reason.words());
         if let Some(log) = &mut self.log {
-            let time_s = self.last_s + self.drive.rate * waited.as_secs_f64();
             log.state(time_s, reason);
         }
     }

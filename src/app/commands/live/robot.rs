@@ -2,8 +2,8 @@
 
 use crate::app::report::export::LiveFrame;
 use crate::geometry::Pose3;
-use crate::lidar::Scan;
-use crate::live::Reason;
+use crate::lidar::{Motion, Scan};
+use crate::live::{LivePose, Reason};
 use crate::localization::Start;
 use crate::recording::Frame;
 
@@ -40,6 +40,38 @@ impl MeasuredPose {
     }
 }
 
+/// A pose that a measured motion carries on since the last scan.
+#[derive(Clone, Copy, Debug)]
+#[cfg_attr(
+    not(feature = "ros2"),
+    allow(dead_code, reason = "only a node publishes it")
+)]
+pub struct CarriedPose {
+    /// The pose now.
+    pub pose: LivePose,
+    /// The motion since the last scan.
+    pub motion: Motion,
+}
+
+/// What is known at a moment at which no scan is localized.
+#[derive(Clone, Copy, Debug)]
+#[cfg_attr(
+    not(feature = "ros2"),
+    allow(dead_code, reason = "only a node publishes it")
+)]
+pub struct Waiting {
+    /// The moment, by the clock of the scans [s].
+    pub time_s: f64,
+    /// Why the localization is in its state.
+    pub reason: Reason,
+    /// The pose, where the motion is measured and carries it, because no scan is localized any more.
+    pub carried: Option<CarriedPose>,
+    /// Number of scans that were dropped so far.
+    pub dropped: u64,
+    /// Number of scans that could not be used so far.
+    pub rejected: u64,
+}
+
 /// What a robot gives besides scans, and what it takes.
 pub struct Robot<'a> {
     /// Pose by the odometry at a time [s]; `None` where it is not measured.
@@ -48,8 +80,8 @@ pub struct Robot<'a> {
     pub proposed: Box<dyn Fn() -> Option<Start> + 'a>,
     /// Takes a frame that was localized.
     pub localized: Box<dyn FnMut(&LiveFrame) + 'a>,
-    /// Takes the reason of the state at a time [s] without a scan.
-    pub waiting: Box<dyn FnMut(f64, Reason) + 'a>,
+    /// Takes what is known while no scan is localized.
+    pub waiting: Box<dyn FnMut(&Waiting) + 'a>,
 }
 
 impl Default for Robot<'_> {
@@ -59,7 +91,7 @@ impl Default for Robot<'_> {
             measured: Box::new(|_| None),
             proposed: Box::new(|| None),
             localized: Box::new(|_| ()),
-            waiting: Box::new(|_, _| ()),
+            waiting: Box::new(|_| ()),
         }
     }
 }

@@ -43,6 +43,8 @@ pub struct LiveFrame {
     pub latency: Duration,
     /// Number of scans that were dropped so far.
     pub dropped: u64,
+    /// Number of scans that could not be used so far.
+    pub rejected: u64,
 }
 
 /// What is known at a moment.
@@ -184,6 +186,7 @@ fn send_frame(sinks: &mut dyn MessageSink, frame: LiveFrame) -> Result<()> {
             "sigma_heading_deg": heading_rad.to_degrees(),
             "latency_ms": 1e3 * frame.latency.as_secs_f64(),
             "dropped": frame.dropped,
+            "rejected": frame.rejected,
         }),
     )
 }

@@ -1,8 +1,6 @@
 //! Messages of ROS 2 in plain CDR, little-endian: numbers aligned to their size, counted from after a header of four bytes that
 //! the transport adds.
 
-use std::fmt::Display;
-
 use nalgebra::{Matrix6, Vector3};
 
 use crate::geometry::Pose3;
@@ -78,11 +76,11 @@ impl Cdr {
     }
 
     /// Names and values of `diagnostic_msgs/KeyValue`.
-    pub fn values(self, values: &[(&str, &dyn Display)]) -> Self {
+    pub fn values(self, values: &[(&str, String)]) -> Self {
         let cdr = self.u32(values.len() as u32);
-        values.iter().fold(cdr, |cdr, (key, value)| {
-            cdr.text(key).text(&value.to_string())
-        })
+        values
+            .iter()
+            .fold(cdr, |cdr, (key, value)| cdr.text(key).text(value))
     }
 
     /// The bytes.

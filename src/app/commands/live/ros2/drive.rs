@@ -121,7 +121,7 @@ pub fn drive(
         }),
         proposed: Box::new(|| shared.proposed()),
         localized: Box::new(|frame| publisher.borrow_mut().localized(frame)),
-        waiting: Box::new(|time_s, reason| publisher.borrow_mut().waiting(time_s, reason)),
+        waiting: Box::new(|waiting| publisher.borrow_mut().waiting(waiting)),
     };
     let interrupt = &drive.context.interrupt;
     drive.run(motion, start, sinks, robot, |inbox, unreadable| {

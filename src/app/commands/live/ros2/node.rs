@@ -98,8 +98,11 @@ impl Node {
         let policies = quality.policies(depth);
         let found = self.topic(&wire_topic(topic), &wire_type(message_type), &policies)?;
         let subscriber = &self.subscriber;
-        let reader = Reader(subscriber.create_simple_datareader_no_key(&found, Some(policies))?);
-        self.readers.push(reader.0.guid());
+        let reader = Reader {
+            topic: topic.to_owned(),
+            messages: subscriber.create_simple_datareader_no_key(&found, Some(policies))?,
+        };
+        self.readers.push(reader.messages.guid());
         Ok(reader)
     }
 
@@ -211,20 +214,24 @@ fn sort_unique(names: &mut Vec<String>) {
 }
 
 /// Receives messages of a topic, with the header of CDR.
-pub struct Reader(SimpleDataReader<Vec<u8>, Raw>);
+pub struct Reader {
+    /// Name of the topic.
+    pub topic: String,
+    messages: SimpleDataReader<Vec<u8>, Raw>,
+}
 
 impl Reader {
     /// The oldest message that was not taken; an error of one that is too large, or of an encoding that ROS 2 does not use.
     pub fn take(&self) -> Option<Result<Vec<u8>, String>> {
-        self.0.drain_read_notifications();
-        let taken = self.0.try_take_one();
+        self.messages.drain_read_notifications();
+        let taken = self.messages.try_take_one();
         let taken = taken.map_err(|error| error.to_string()).transpose()?;
         Some(taken.map(|message| message.sample))
     }
 
     /// Has a message wake this thread.
     pub fn wakes(&self, waker: &Waker) {
-        self.0.set_waker(Some(waker.clone()));
+        self.messages.set_waker(Some(waker.clone()));
     }
 }
 

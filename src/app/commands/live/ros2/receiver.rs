@@ -1,6 +1,5 @@
 //! The thread that receives: clouds into the inbox, all else to where it is known.
 
-use std::collections::BTreeSet;
 use std::iter;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
@@ -44,15 +43,7 @@ pub struct Receiver {
     static_transforms: Reader,
     proposals: Reader,
     elevation_bias_rad: f64,
-    warned: Warned,
-}
-
-/// Warnings that were printed.
-#[derive(Default)]
-struct Warned {
-    /// Topics with damaged messages.
-    of_messages: BTreeSet<String>,
-    of_times: bool,
+    has_warned_of_times: bool,
 }
 
 /// Watches that messages of a topic arrive.
@@ -63,30 +54,28 @@ struct Watch {
     has_warned: bool,
 }
 
-impl Warned {
-    /// Reads the messages of a topic and has them taken; those that are damaged are left out.
-    fn receive<T>(
-        &mut self,
-        topic: &str,
-        reader: &Reader,
-        read: impl Fn(&[u8]) -> Result<T, String>,
-        mut take: impl FnMut(T),
-    ) {
-        for message in iter::from_fn(|| reader.take()).take(MOST_AT_ONCE) {
-            match message.and_then(|message| read(&message)) {
-                Ok(read) => take(read),
-                Err(problem) => self.warn_of_message(topic, &problem),
-            }
+/// Reads the messages of a topic and has them taken; those that are damaged are left out.
+fn receive<T>(
+    shared: &Shared,
+    reader: &Reader,
+    read: impl Fn(&[u8]) -> Result<T, String>,
+    mut take: impl FnMut(T),
+) {
+    for message in iter::from_fn(|| reader.take()).take(MOST_AT_ONCE) {
+        match message.and_then(|message| read(&message)) {
+            Ok(read) => take(read),
+            Err(problem) => leave_out(shared, reader, &problem),
         }
     }
+}
 
-    /// Warns of the first damaged message of a topic.
-    fn warn_of_message(&mut self, topic: &str, problem: &str) {
-        if self.of_messages.insert(topic.to_owned()) {
-            tracing::warn!(
-                "a message of {topic} is left out: it {problem}; check that its publisher has the same version of the type (later ones are not reported)"
-            );
-        }
+/// Counts a damaged message, and warns of the first one of its topic.
+fn leave_out(shared: &Shared, reader: &Reader, problem: &str) {
+    if shared.count_damaged(&reader.topic) == 1 {
+        tracing::warn!(
+            "a message of {} is left out: it {problem}; check that its publisher has the same version of the type (later ones are counted in the diagnostics)",
+            reader.topic
+        );
     }
 }
 
@@ -165,7 +154,7 @@ impl Receiver {
                 1,
             )?,
             elevation_bias_rad: elevation_bias_deg.to_radians(),
-            warned: Warned::default(),
+            has_warned_of_times: false,
         })
     }
 
@@ -199,6 +188,7 @@ impl Receiver {
                 if interrupt.requested() || inbox.is_closed() {
                     break;
                 }
+                let arrived = Instant::now();
                 let Some(message) = self.clouds.take() else {
                     break;
                 };
@@ -209,12 +199,11 @@ impl Receiver {
                 match message {
                     Ok(cloud) => {
                         shared.cloud(number, &cloud.frame, cloud.moment_ns);
-                        inbox.push(self.arrived(number, cloud));
+                        inbox.push_arrived(self.arrived(number, cloud), arrived);
                     }
                     Err(problem) => {
                         unreadable.fetch_add(1, Ordering::Relaxed);
-                        self.warned
-                            .warn_of_message(&self.cloud_watch.topic, &problem);
+                        leave_out(shared, &self.clouds, &problem);
                     }
                 }
                 number += 1;
@@ -238,35 +227,24 @@ impl Receiver {
     }
 
     fn receive_all_but_clouds(&mut self, shared: &Shared) {
-        let warned = &mut self.warned;
-        warned.receive(
-            "/tf_static",
-            &self.static_transforms,
-            read_transforms,
-            |it| {
-                shared.static_transforms(it);
-            },
-        );
-        warned.receive("/tf", &self.transforms, read_transforms, |it| {
+        receive(shared, &self.static_transforms, read_transforms, |it| {
+            shared.static_transforms(it);
+        });
+        receive(shared, &self.transforms, read_transforms, |it| {
             shared.transforms(it);
         });
         if let Some((odometry, watch)) = &mut self.odometry {
-            warned.receive("the odometry", odometry, read_odometry, |it| {
+            receive(shared, odometry, read_odometry, |it| {
                 shared.odometry(it);
                 watch.note_arrival();
             });
         }
         let propose = |(pose, deviations)| shared.propose(pose, deviations);
-        warned.receive(
-            "/initialpose",
-            &self.proposals,
-            read_pose_with_deviations,
-            propose,
-        );
+        receive(shared, &self.proposals, read_pose_with_deviations, propose);
     }
 
     fn arrived(&mut self, number: usize, cloud: ReceivedCloud) -> ArrivedFrame {
-        if cloud.has_unknown_times && !std::mem::replace(&mut self.warned.of_times, true) {
+        if cloud.has_unknown_times && !std::mem::replace(&mut self.has_warned_of_times, true) {
             tracing::warn!(
                 "the times of the points of {} are ignored: in no unit do they last 10 ms to 1 s and agree with the stamp; correct the driver, or set motion_compensation",
                 self.cloud_watch.topic

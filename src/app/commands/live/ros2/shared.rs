@@ -1,6 +1,6 @@
 //! What the thread that receives knows and the one that computes needs: frames, odometry, and poses that were proposed.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::frames::{FrameTree, Relation};
@@ -47,6 +47,8 @@ struct Known {
     has_warned_of_mounting: bool,
     /// Whether it was reported that the motion is that of the transforms.
     has_reported_motion: bool,
+    /// Numbers of damaged messages by their topics.
+    damaged: BTreeMap<String, u64>,
 }
 
 /// What of the robot is known at a scan.
@@ -173,6 +175,19 @@ impl Shared {
             );
         }
         Some(measured)
+    }
+
+    /// Counts a damaged message of a topic; returns how many it has had.
+    pub fn count_damaged(&self, topic: &str) -> u64 {
+        let mut known = self.known();
+        let count = known.damaged.entry(topic.to_owned()).or_default();
+        *count += 1;
+        *count
+    }
+
+    /// Number of damaged messages of all topics.
+    pub fn damaged(&self) -> u64 {
+        self.known().damaged.values().sum()
     }
 
     /// Takes a pose in the map that was proposed, with standard deviations of position [m] and heading [rad].
@@ -442,6 +457,14 @@ mod tests {
         let other = shared.measured_by_transforms(5.1).unwrap();
         assert_eq!(other.odom_frame, "world");
         assert!(other.since(&first, 0.1).is_none());
+    }
+
+    #[test]
+    fn damaged_messages_are_counted_by_topic() {
+        let shared = robot();
+        assert_eq!(shared.damaged(), 0);
+        let counts = ["/tf", "/odom", "/tf"].map(|topic| shared.count_damaged(topic));
+        assert_eq!((counts, shared.damaged()), ([1, 1, 2], 3));
     }
 
     #[test]
