@@ -207,7 +207,15 @@ fn damaged_clouds_a_stall_and_a_proposed_pose_are_survived_and_reported() {
     };
     let (received, report) = (&outcome["received"], &outcome["report"]);
     let counts = ["received", "rejected"].map(|key| report["live"][key].as_u64());
-    assert!(counts[0] == Some(11) && counts[1] >= Some(2), "{report}");
+    // Those that arrived were localized or rejected.
+    let rejected = counts[1].unwrap();
+    assert!(
+        rejected >= 2 && counts[0] == Some(11 + rejected),
+        "{report}"
+    );
+    let of_damaged = received["/diagnostics"].as_array().unwrap().last().unwrap();
+    let of_damaged = ["rejected scans", "damaged messages"].map(|key| &of_damaged["values"][key]);
+    assert_eq!(of_damaged, [rejected.to_string().as_str(); 2], "{report}");
     let stderr = outcome["stderr"].as_str().unwrap();
     assert_eq!(
         stderr.matches("a message of /points is left out").count(),
@@ -216,7 +224,7 @@ fn damaged_clouds_a_stall_and_a_proposed_pose_are_survived_and_reported() {
     );
     let expected = [
         "tracking: the scan agrees with the map",
-        "lost: no scan arrived for too long",
+        "lost: no scan that can be used arrived for too long",
         "tracking: the scan agrees with the map",
         "searching: a pose was proposed that no scan has confirmed yet",
         "tracking: the scan agrees with the map",
@@ -228,6 +236,102 @@ fn damaged_clouds_a_stall_and_a_proposed_pose_are_survived_and_reported() {
     );
     let (_, last) = *positions(&received["/fpmcl/pose"]).last().unwrap();
     assert!(distance_m(last, [5.5, 0.0, last[2]]) < 0.1, "{last:?}");
+}
+
+/// Frame of the robot that drives from frame 5 to frame 11 and back, after some tenths of a second.
+fn frame_to_and_fro(after: usize) -> usize {
+    let turn = after % 12;
+    5 + turn.min(12 - turn)
+}
+
+#[test]
+fn a_proposed_pose_that_is_wrong_is_never_published_and_the_robot_is_found_again() {
+    let recording = street();
+    let Some(outcome) = robot(&recording, "misled", &[]) else {
+        return;
+    };
+    let received = &outcome["received"];
+    let expected = [
+        "tracking: ",
+        "searching: a pose was proposed that no scan has confirmed yet",
+        "tracking: ",
+    ];
+    let states = &received["/diagnostics"];
+    assert!(states_include(received, &expected), "{states}");
+    let poses = positions(&received["/fpmcl/pose"]);
+    let transforms = received["/tf"].as_array().unwrap().iter();
+    let transforms = transforms.flat_map(positions);
+    for (moment, position) in poses.iter().copied().chain(transforms) {
+        let frame = if moment < 5 {
+            moment
+        } else {
+            frame_to_and_fro(moment - 5)
+        };
+        let expected = [0.5 * frame as f64, 0.0, position[2]];
+        assert!(
+            distance_m(position, expected) < 0.1,
+            "{moment} {position:?}"
+        );
+    }
+    assert!(poses.last().unwrap().0 >= 5);
+}
+
+#[test]
+fn a_driver_that_repeats_a_scan_is_as_one_that_sends_none() {
+    let recording = street();
+    let Some(outcome) = robot(&recording, "frozen", &[]) else {
+        return;
+    };
+    let received = &outcome["received"];
+    let expected = [
+        "tracking: the scan agrees with the map",
+        "coasting: the scans that arrive cannot be used; the motion carries the pose",
+        "lost: no scan that can be used arrived for too long",
+        "tracking: the scan agrees with the map",
+    ];
+    let states = &received["/diagnostics"];
+    assert!(states_include(received, &expected), "{states}");
+    let lost = states.as_array().unwrap().iter();
+    let mut lost = lost.filter(|it| it["message"].as_str().unwrap().starts_with("lost: "));
+    let values = &lost.next().unwrap()["values"];
+    assert!(values["rejected scans"] != "0", "{values}");
+    // What the last scan showed.
+    assert!(values["agreement"].is_string(), "{values}");
+    let poses = positions(&received["/fpmcl/pose"]);
+    let frames: Vec<usize> = poses.iter().map(|it| it.0).collect();
+    assert_eq!(frames, Vec::from_iter(0..12));
+    let stderr = outcome["stderr"].as_str().unwrap();
+    assert_eq!(stderr.matches("is not later than the last one").count(), 1);
+}
+
+#[test]
+fn another_type_of_message_on_the_topic_of_the_clouds_is_reported() {
+    let recording = street();
+    let Some(outcome) = robot(&recording, "mistyped", &[]) else {
+        return;
+    };
+    let stderr = outcome["stderr"].as_str().unwrap();
+    let expected = "no sensor_msgs/msg/PointCloud2 has arrived on /points for 5 s; its type is sensor_msgs/msg/LaserScan elsewhere";
+    assert!(stderr.contains(expected), "{stderr}");
+}
+
+#[test]
+fn reliable_clouds_are_asked_for_by_a_node_of_another_name() {
+    let recording = street();
+    let arguments = [
+        "--reliability=reliable",
+        "--node-name=front",
+        "--remap=/front/pose:=/fpmcl/pose",
+        "--remap=/front/odometry:=/fpmcl/odometry",
+        "--remap=/front/map:=/fpmcl/map",
+    ];
+    let Some(outcome) = robot(&recording, "reliable", &arguments) else {
+        return;
+    };
+    let received = &outcome["received"];
+    assert_eq!(positions(&received["/fpmcl/pose"]).len(), 12);
+    let name = &received["/diagnostics"][0]["name"];
+    assert_eq!(name, "front: localization");
 }
 
 #[test]
@@ -246,12 +350,10 @@ fn a_robot_that_is_carried_elsewhere_is_lost_without_a_pose_and_found_again() {
     let transforms = transforms.flat_map(positions);
     for (moment, position) in poses.iter().copied().chain(transforms) {
         assert!(!(10..35).contains(&moment), "{moment} {position:?}");
-        // Then it drove to frame 11 and back to 5.
-        let turn = moment.saturating_sub(35) % 12;
         let frame = if moment < 35 {
             moment
         } else {
-            5 + turn.min(12 - turn)
+            frame_to_and_fro(moment - 35)
         };
         let expected = [0.5 * frame as f64, 0.0, position[2]];
         let is_elsewhere = (5..10).contains(&moment);
@@ -368,6 +470,50 @@ fn with_wheels_poses_are_those_of_the_base_and_the_transform_is_that_of_its_odom
             let expected = "the motion is that of base_link in odom, by /tf";
             assert!(stderr.contains(expected), "{stderr}");
         }
+    }
+}
+
+#[test]
+fn while_the_clouds_stall_the_pose_goes_on_with_the_wheels() {
+    let recording = street();
+    let Some(outcome) = robot(&recording, "carried", &["--odometry=/odom"]) else {
+        return;
+    };
+    let received = &outcome["received"];
+    let expected = [
+        "tracking: ",
+        "coasting: no scan arrives; the motion carries the pose",
+    ];
+    assert!(
+        states_include(received, &expected),
+        "{}",
+        received["/diagnostics"]
+    );
+    let last_scan = 4.0;
+    let tenths = |it: &Value| it["stamp_ns"].as_f64().unwrap() * 1e-8 - 10.0;
+    let poses = received["/fpmcl/pose"].as_array().unwrap().iter();
+    let carried: Vec<&Value> = poses.filter(|it| tenths(it) > last_scan + 0.5).collect();
+    assert!(carried.len() >= 3, "{received}");
+    for pose in &carried {
+        let [from, to] = [last_scan, tenths(pose)].map(driven_by_wheels);
+        let (_, [x, y, _]) = positions(&json!([pose]))[0];
+        let expected = [0.5 * last_scan - 1.0 + to[0] - from[0], to[1] - from[1]];
+        let wrong_m = (x - expected[0]).hypot(y - expected[1]);
+        assert!(wrong_m < 0.1, "{pose}");
+        // The variance of x, which grows.
+        let of_scan = received["/fpmcl/pose"][4]["covariance"][0].as_f64();
+        assert!(pose["covariance"][0].as_f64() > of_scan, "{pose}");
+    }
+    let transforms = received["/tf"].as_array().unwrap().iter();
+    let of_program = transforms.flat_map(|it| it.as_array().unwrap());
+    let of_stall = of_program.filter(|it| it["parent"] == "map" && tenths(it) > last_scan + 0.5);
+    let of_stall: Vec<&Value> = of_stall.collect();
+    assert!(of_stall.len() >= 3, "{received}");
+    let drift = driven_by_wheels(last_scan);
+    for transform in of_stall {
+        let (_, [x, y, _]) = positions(&json!([transform]))[0];
+        let wrong_m = (x + 3.0 + drift[0] - 0.5 * last_scan).hypot(y + drift[1]);
+        assert!(transform["child"] == "odom" && wrong_m < 0.1, "{transform}");
     }
 }
 

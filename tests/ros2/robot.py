@@ -12,6 +12,7 @@ import pathlib
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from array import array as array_of
@@ -66,6 +67,11 @@ class PointCloud2(IdlStruct, **ros("sensor_msgs", "PointCloud2")):
 
 @dataclass
 class Garbage(IdlStruct, **ros("sensor_msgs", "PointCloud2")):
+    data: sequence[uint8]
+
+
+@dataclass
+class LaserScan(IdlStruct, **ros("sensor_msgs", "LaserScan")):
     data: sequence[uint8]
 
 
@@ -275,11 +281,11 @@ class Robot:
 
     PERIOD_NS = 10**8
 
-    def __init__(self, folder, receiver):
+    def __init__(self, folder, receiver, quality=OF_SENSORS):
         self.scans = sorted(pathlib.Path(folder).glob("*.bin"))
         self.receiver = receiver
         self.participant = DomainParticipant(0)
-        self.clouds = writer(self.participant, "/points", PointCloud2, OF_SENSORS)
+        self.clouds = writer(self.participant, "/points", PointCloud2, quality)
         self.proposals = writer(self.participant, "/initialpose", PoseWithCovarianceStamped, USUAL)
         # Transforms, and the odometry.
         self.transforms = writer(self.participant, "/tf", TFMessage, USUAL)
@@ -293,12 +299,13 @@ class Robot:
         return 10**9 + self.PERIOD_NS * frame + later_ns
 
     def cloud(self, frame, later_ns=0, cut=0, elsewhere=None):
-        """Sends a scan; of which the last bytes are missing, or which is that of another place."""
+        """Sends a scan, of which the last bytes may be missing, or which may be that of another place."""
         data = self.scans[frame].read_bytes() if elsewhere is None else elsewhere
         fields = [PointField(name, 4 * k, 7, 1) for k, name in enumerate(["x", "y", "z", "intensity"])]
         count = len(data) // 16
         header = Header(stamp(self.moment(frame, later_ns)), "lidar")
         data = data[: len(data) - cut]
+        self.sent = time.monotonic()
         self.clouds.write(PointCloud2(header, 1, count, fields, False, 16, 16 * count, data, True))
 
     def drive(self, frames, later_ns=0):
@@ -313,6 +320,25 @@ class Robot:
 
     def before(self, frame):
         """What else is sent before a scan."""
+
+    def drive_until_found(self, first):
+        """Drives from frame 5 to frame 11 and back, from a tenth of a second on, until a pose of that drive is received."""
+        for k in range(120):
+            frame = 5 + min(k % 12, 12 - k % 12)
+            moment = first + k
+            self.cloud(frame, later_ns=(moment - frame) * self.PERIOD_NS)
+            time.sleep(0.1)
+            if any(self.receiver.has_pose(self.moment(it)) for it in range(first, moment)):
+                return
+        sys.exit("not found again")
+
+    def propose(self, x, y, moment_ns):
+        """Proposes a pose, as rviz does."""
+        covariance = [0.0] * 36
+        covariance[0] = covariance[7] = 0.25
+        covariance[35] = 0.07
+        proposal = PoseWithCovariance(self.pose(x, y), covariance)
+        self.proposals.write(PoseWithCovarianceStamped(Header(stamp(moment_ns), "map"), proposal))
 
     def pose(self, x, y=0.0):
         return Pose(Vector3(x, y, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
@@ -361,16 +387,11 @@ def events(folder, receiver, _program):
     for _ in range(20):
         garbage.write(Garbage(bytes([255]) * 1000))
         time.sleep(0.1)
-    seen = receiver.wait_for_state("lost: no scan arrived for too long")
+    seen = receiver.wait_for_state("lost: no scan that can be used arrived for too long")
     later_ns = 2 * 10**9
     robot.drive(range(6, 9), later_ns)
     seen = receiver.wait_for_state("tracking: ", seen)
-    covariance = [0.0] * 36
-    covariance[0] = covariance[7] = 0.25
-    covariance[35] = 0.07
-    header = Header(stamp(robot.moment(8, later_ns)), "map")
-    proposal = PoseWithCovariance(robot.pose(4.3, 0.2), covariance)
-    robot.proposals.write(PoseWithCovarianceStamped(header, proposal))
+    robot.propose(4.3, 0.2, robot.moment(8, later_ns))
     seen = receiver.wait_for_state("searching: a pose was proposed", seen)
     # Frames without a confirmed pose have none.
     for frame in (9, 10):
@@ -404,16 +425,71 @@ def kidnapped(folder, receiver, _program):
         robot.cloud(5, later_ns=k * robot.PERIOD_NS, elsewhere=elsewhere)
         time.sleep(0.1)
     receiver.wait_for_state("lost: ")
-    # To frame 11 and back to 5, until it is found.
-    for k in range(120):
-        frame = 5 + min(k % 12, 12 - k % 12)
-        moment = 35 + k
-        robot.cloud(frame, later_ns=(moment - frame) * robot.PERIOD_NS)
-        time.sleep(0.1)
-        if any(receiver.has_pose(robot.moment(it)) for it in range(35, moment)):
-            # Less than half of the scans is localized.
-            return 3
-    sys.exit("not found again")
+    robot.drive_until_found(35)
+    # Less than half of the scans is localized.
+    return [3]
+
+
+def misled(folder, receiver, _program):
+    """A pose across the street is proposed while it is tracked."""
+    robot = Robot(folder, receiver)
+    robot.drive(range(5))
+    seen = receiver.wait_for_state("tracking: ")
+    robot.propose(2.0, 4.0, robot.moment(4))
+    receiver.wait_for_state("searching: a pose was proposed", seen)
+    robot.drive_until_found(5)
+    # Depending on when it is found.
+    return [0, 3]
+
+
+def frozen(folder, receiver, _program):
+    """The stamps of the driver stand still, and go on."""
+    robot = Robot(folder, receiver)
+    robot.drive(range(5))
+    words = "lost: no scan that can be used arrived for too long"
+    for _ in range(600):
+        robot.cloud(4)
+        time.sleep(0.03)
+        if any(words in it["message"] for it in receiver.of("/diagnostics")):
+            break
+    receiver.wait_for_state(words)
+    robot.drive(range(5, 12))
+    # Depending on how many were left out.
+    return [0, 3]
+
+
+def mistyped(folder, receiver, program):
+    """Another sender has another type of message on the topic of the clouds, which then fall silent."""
+    stranger = DomainParticipant(0)
+    _writer = writer(stranger, "/points", LaserScan, OF_SENSORS)
+    robot = Robot(folder, receiver)
+    robot.drive(range(3))
+    receiver.wait("the other type", lambda: "has arrived on /points" in program.said())
+
+
+def carried(folder, receiver, _program):
+    """The clouds stall, and the wheels turn on at the pace of the clock."""
+    robot = Wheeled(folder, receiver)
+    robot.place()
+    robot.drive(range(5))
+    is_carried = lambda: sum(it["stamp_ns"] > robot.moment(6) for it in receiver.of("/fpmcl/pose")) >= 3
+    while not is_carried() and time.monotonic() < robot.sent + 60:
+        robot.turn_wheels(4 + 10 * (time.monotonic() - robot.sent))
+        time.sleep(0.01)
+    receiver.wait("poses without scans", is_carried, seconds=1)
+
+
+def reliable(folder, receiver, _program):
+    """The program asks for reliable clouds: it hears a sender that is reliable, and not another one."""
+    stranger = DomainParticipant(0)
+    other = writer(stranger, "/points", PointCloud2, OF_SENSORS)
+    # The program offers its reader of proposals after that of clouds.
+    proposals = writer(stranger, "/initialpose", PoseWithCovarianceStamped, USUAL)
+    robot = Robot(folder, receiver, USUAL)
+    receiver.wait("the reader of proposals of the stranger", proposals.get_matched_subscriptions)
+    robot.drive(range(12))
+    if other.get_matched_subscriptions():
+        sys.exit("a sender that is not reliable is heard")
 
 
 def restarted(folder, receiver, program):
@@ -440,10 +516,15 @@ class Program:
 
     def __init__(self, command):
         self.command = command
+        self.log = tempfile.NamedTemporaryFile()
         self.start([])
 
     def start(self, more):
-        self.process = subprocess.Popen([*self.command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen([*self.command, *more], stdout=subprocess.PIPE, stderr=self.log, text=True)
+
+    def said(self):
+        """Its messages so far."""
+        return pathlib.Path(self.log.name).read_text()
 
     def restart(self, more):
         """Kills it, and starts it again with another start and further arguments."""
@@ -457,18 +538,18 @@ def play(folder, scenario, command):
     program = Program(command)
     receiver = Receiver()
     try:
-        expected = scenario(folder, receiver, program) or 0
+        expected = scenario(folder, receiver, program) or [0]
         program.process.send_signal(signal.SIGTERM)
-        stdout, stderr = program.process.communicate(timeout=120)
+        stdout, _ = program.process.communicate(timeout=120)
     except SystemExit as failed:
         program.process.kill()
-        sys.exit(f"{failed}; the program says: {program.process.communicate()[1]}")
+        sys.exit(f"{failed}; the program says: {program.said()}")
     finally:
         program.process.kill()
         receiver.process.kill()
-    if program.process.returncode != expected:
-        sys.exit(f"the program ends with {program.process.returncode}: {stderr}")
-    print(json.dumps({"received": receiver.messages, "report": json.loads(stdout), "stderr": stderr}))
+    if program.process.returncode not in expected:
+        sys.exit(f"the program ends with {program.process.returncode}: {program.said()}")
+    print(json.dumps({"received": receiver.messages, "report": json.loads(stdout), "stderr": program.said()}))
 
 
 def has_loopback_alone():
@@ -482,5 +563,6 @@ if __name__ == "__main__":
     if sys.argv[1] == "receive":
         receive()
     folder, scenario = sys.argv[2:4]
-    scenarios = {it.__name__: it for it in [drive, events, kidnapped, restarted, wheels]}
+    all_of_them = [drive, events, kidnapped, misled, frozen, mistyped, carried, reliable, restarted, wheels]
+    scenarios = {it.__name__: it for it in all_of_them}
     play(folder, scenarios[scenario], sys.argv[5:])
