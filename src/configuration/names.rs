@@ -38,16 +38,18 @@ const ALIASES: [(&str, &str); 22] = [
 const WITHOUT_EFFECT: [&str; 2] = ["range_image.max_instance", "range_image.render_instanced"];
 
 /// Last parts of earlier keys whose values are fixed now.
-const REMOVED: [&str; 10] = [
+const REMOVED: [&str; 12] = [
     "basin_m",
     "basin_rad",
     "freedom",
+    "independent_share",
     "max_sigmas",
     "min_incidence",
     "minima",
     "period_s",
     "refined_share",
     "tracking_rounds",
+    "weighed_beams",
     "widening",
 ];
 

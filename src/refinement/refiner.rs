@@ -3,7 +3,7 @@
 //! Each is optional, and the result of each is accepted only if it lowers the objective. With both, the swarm searches
 //! where the uncertainty of the estimate exceeds the basin of Gauss-Newton, and only there.
 
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, Vector3};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -16,7 +16,9 @@ use super::wide_search::{self, WideSearchConfig};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
 use crate::map::SensorAttitude;
-use crate::registration::{RegistrationConfig, RegistrationResult, register_informative};
+use crate::registration::{
+    RegistrationConfig, RegistrationResult, covariance_at, register_informative,
+};
 use crate::rendering::RenderError;
 use crate::validation::{
     InvalidValue, Validate, in_range, nested, not_negative, positive, require,
@@ -77,9 +79,6 @@ pub struct FrameRefinementConfig {
     pub max_reach_rad: f64,
     /// The search from farther away.
     pub wide_search: WideSearchConfig,
-    /// Increase of the mean cost that makes a pose e times less likely, for covariances [m].
-    #[default(0.001)]
-    pub scale_m: f64,
 }
 
 impl Validate for FrameRefinementConfig {
@@ -100,8 +99,7 @@ impl Validate for FrameRefinementConfig {
         };
         let (m, rad) = (self.min_reach_m, self.min_reach_rad);
         ordered("max_reach_m", self.max_reach_m, "min_reach_m", m)?;
-        ordered("max_reach_rad", self.max_reach_rad, "min_reach_rad", rad)?;
-        positive("scale_m", self.scale_m)
+        ordered("max_reach_rad", self.max_reach_rad, "min_reach_rad", rad)
     }
 }
 
@@ -238,11 +236,23 @@ pub fn refine_frame(
     }
     if config.method != Method::None {
         frame.covariance = match finished {
-            Some(registered) => registered.planar_covariance(),
-            None => objective.covariance(&frame.pose, patch.as_ref(), config.scale_m)?,
-        };
+            Some(registered) => Some(registered.planar_covariance()),
+            None => covariance_at(
+                objective.renderer,
+                objective.registered,
+                &frame.map_from_lidar,
+                &config.gauss_newton,
+            )?,
+        }
+        .unwrap_or_else(undetermined)
+            + config.gauss_newton.of_map();
     }
     Ok(Some(frame))
+}
+
+/// Covariance of (x, y, heading) where too few beams hit the map: half a metre and 0.05 rad.
+fn undetermined() -> Matrix3<f64> {
+    Matrix3::from_diagonal(&Vector3::new(0.25, 0.25, 0.0025))
 }
 
 /// Searches for a better pose with swarms over the surfaces of the map.
@@ -331,7 +341,7 @@ fn finish(
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
-    use nalgebra::{Vector2, Vector3};
+    use nalgebra::Vector2;
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
@@ -518,11 +528,13 @@ mod tests {
         let registered = register_informative(&world, &beams, start, &config.gauss_newton);
         let registered = registered.unwrap().unwrap();
         assert_eq!(frame.map_from_lidar, registered.map_from_lidar);
-        assert_eq!(frame.covariance, registered.planar_covariance());
+        let of_map = config.gauss_newton.of_map();
+        assert_eq!(frame.covariance, registered.planar_covariance() + of_map);
     }
 
     #[test]
-    fn a_frame_whose_registration_is_rejected_has_the_covariance_of_the_objective() {
+    fn a_frame_whose_registration_is_rejected_has_the_covariance_of_its_scan_at_the_pose_that_is_kept()
+     {
         let world = TestWorld::street();
         let truth = world.pose_at(18.0, 0.2, 0.05);
         let beams: Vec<Beam> = world.scan(&truth).beams().step_by(7).collect();
@@ -530,16 +542,11 @@ mod tests {
             method: Method::GaussNewton,
             ..FrameRefinementConfig::default()
         };
-        let expected = Matrix3::new(
-            25e-4, 9e-4, 4e-5, //
-            9e-4, 16e-4, 2e-5, //
-            4e-5, 2e-5, 16e-6,
-        );
-        // The costs are those of a Gaussian around the estimate, from which the surfaces lead away.
+        // The costs are least at the estimate, from which the surfaces lead away.
         let ranges = GaussianWorld {
             mean: truth,
-            information: expected.try_inverse().unwrap(),
-            scale_m: config.scale_m,
+            information: Matrix3::from_diagonal(&Vector3::new(400.0, 400.0, 1e5)),
+            scale_m: 0.001,
         };
         let renderer = Astray {
             ranges: &ranges,
@@ -554,7 +561,10 @@ mod tests {
         let frame = refine_frame(&objective, &truth, &covariance, distance, &config, &mut rng);
         let frame = frame.unwrap().unwrap();
         assert_eq!(frame.pose, truth);
-        assert_relative_eq!(frame.covariance, expected, max_relative = 1e-3);
+        let kept = &frame.map_from_lidar;
+        let expected = covariance_at(&renderer, &beams, kept, &config.gauss_newton);
+        let expected = expected.unwrap().unwrap() + config.gauss_newton.of_map();
+        assert_eq!(frame.covariance, expected);
     }
 
     #[test]

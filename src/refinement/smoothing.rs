@@ -5,12 +5,11 @@
 //! min  Σ ρ(‖xᵢ ⊖ pᵢ‖²_Rᵢ) + Σ ‖zᵢ⁻¹ (xᵢ⁻¹ xᵢ₊₁)‖²_Qᵢ        ρ(s) = c² ln(1 + s/c²)
 //! ```
 //!
-//! pᵢ: measured pose of a frame; zᵢ, Qᵢ: odometry between neighbors. Rᵢ: share of the covariance of the pose that it does not
-//! have in common with its neighbors. They see the same surfaces, whose errors are most of theirs, and these do not contradict
-//! the odometry.
+//! pᵢ, Rᵢ: measured pose of a frame; zᵢ, Qᵢ: odometry between neighbors. Rᵢ is without the error that a frame has in common with
+//! its neighbors: they see the same surfaces, whose errors are most of theirs, and these do not contradict the odometry.
 //!
 //! The normal equations are block tridiagonal: a step costs one forward and one backward pass, and so do the
-//! diagonal blocks of their inverse, the marginal covariances (Rauch, Tung and Striebel, 1965), with the whole covariances.
+//! diagonal blocks of their inverse, the marginal covariances (Rauch, Tung and Striebel, 1965).
 //! Grisetti et al., *A Tutorial on Graph-Based SLAM* (2010), with the robust kernel of Cauchy.
 
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
@@ -22,7 +21,7 @@ use crate::localization::OdometryNoise;
 use crate::localization::motion::TurnDriveTurn;
 use crate::localization::particles::deviation;
 use crate::statistics::median;
-use crate::validation::{InvalidValue, Validate, fraction, in_range, positive};
+use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Least noise of the odometry and robustness against wrong frames.
 ///
@@ -41,10 +40,6 @@ pub struct SmoothingConfig {
     /// Least standard deviation of the heading, per frame [rad].
     #[default(0.001)]
     pub odometry_turn_rad: f64,
-    /// Share of the variance of a measured pose that it does not have in common with its neighbours, which see the same
-    /// surfaces (unitless).
-    #[default(0.25)]
-    pub independent_share: f64,
     /// Scale c of the robust kernel (standard deviations): a pose that is c off has half of the weight. Of errors of x, y and
     /// heading that are normal, 2.9 % are beyond 3.
     #[default(3.0)]
@@ -75,8 +70,6 @@ impl Validate for SmoothingConfig {
         positive("odometry_ahead_m", self.odometry_ahead_m)?;
         positive("odometry_aside_m", self.odometry_aside_m)?;
         positive("odometry_turn_rad", self.odometry_turn_rad)?;
-        positive("independent_share", self.independent_share)?;
-        fraction("independent_share", self.independent_share)?;
         positive("robust_sigmas", self.robust_sigmas)?;
         in_range("iterations", self.iterations, 1..=1000)
     }
@@ -148,14 +141,7 @@ pub fn smooth(
     config: &SmoothingConfig,
 ) -> Vec<Pose2> {
     debug_assert!(start.len() == priors.len() && start.len() == increments.len());
-    let independent = |prior: &Option<FramePrior>| {
-        prior.map(|prior| FramePrior {
-            covariance: config.independent_share * prior.covariance,
-            ..prior
-        })
-    };
-    let priors: Vec<_> = priors.iter().map(independent).collect();
-    let problem = Problem::new(&priors, increments, config);
+    let problem = Problem::new(priors, increments, config);
     let mut poses = start.to_vec();
     let mut cost = problem.cost(&poses);
     let mut damping = 1e-6;
@@ -186,8 +172,6 @@ pub fn smooth(
 /// Returns the marginal covariances of (x, y, heading) in the axes of the map [m², m·rad, rad²] of a
 /// smoothed trajectory; `None` where no frame has a measured pose. The arguments are those of
 /// [`smooth`], of which `smoothed` is the result.
-///
-/// They are those of a smoothing whose `independent_share` is 1.
 pub fn covariances(
     smoothed: &[Pose2],
     priors: &[Option<FramePrior>],
@@ -469,7 +453,6 @@ mod tests {
                 odometry_ahead_m: 0.005,
                 odometry_aside_m: 0.005,
                 odometry_turn_rad: 0.0005,
-                independent_share: 1.0,
                 ..SmoothingConfig::default()
             };
             let smooth = smooth(&noisy, &priors(&noisy, 0.05, 0.005), &odometry, &config);
@@ -513,24 +496,18 @@ mod tests {
                 .map(|(frame, pose)| pose * surfaces[frame / 15])
                 .collect();
             let odometry = disturbed(&increments(&truth), 0.01, 3e-4, seed + 100);
-            let smoothed = |independent_share: f64| {
-                let config = SmoothingConfig {
-                    independent_share,
-                    ..SmoothingConfig::default()
-                };
-                let priors = priors(&measured, 0.0041, 1.1e-4);
-                smooth(&measured, &priors, &odometry, &config)
+            let smoothed = |sigma_m: f64, sigma_rad: f64| {
+                let priors = priors(&measured, sigma_m, sigma_rad);
+                smooth(&measured, &priors, &odometry, &SmoothingConfig::default())
             };
-            for (sum, poses) in squares
-                .iter_mut()
-                .zip([&measured, &smoothed(0.25), &smoothed(1.0)])
-            {
+            let poses = [&measured, &smoothed(0.001, 5e-5), &smoothed(0.0041, 1.1e-4)];
+            for (sum, poses) in squares.iter_mut().zip(poses) {
                 *sum += rmse(poses, &truth).powi(2);
             }
         }
-        let [before, with_common, all_independent] = squares;
-        assert!(with_common < 1.02 * before, "{squares:?}");
-        assert!(with_common < all_independent, "{squares:?}");
+        let [before, of_scans, with_surfaces] = squares;
+        assert!(of_scans < 1.02 * before, "{squares:?}");
+        assert!(of_scans < with_surfaces, "{squares:?}");
     }
 
     #[test]
@@ -629,7 +606,6 @@ mod tests {
             odometry_ahead_m: 0.01,
             odometry_aside_m: 0.01,
             odometry_turn_rad: 0.001,
-            independent_share: 1.0,
             robust_sigmas: 1e3,
             ..SmoothingConfig::default()
         };
@@ -740,7 +716,6 @@ mod tests {
         let truth = corner();
         let config = SmoothingConfig {
             iterations: 1,
-            independent_share: 1.0,
             ..SmoothingConfig::default()
         };
         let mut is_refused = false;

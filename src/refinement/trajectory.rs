@@ -633,14 +633,14 @@ impl TrajectoryRefiner {
     ) {
         let config = &self.config.refinement;
         let frames = &self.frames[rows.clone()];
-        let priors: Vec<Option<FramePrior>> = frames.iter().map(FrameResult::prior).collect();
+        let of_map = config.gauss_newton.of_map();
+        let prior = |frame: &FrameResult| frame.prior(&of_map);
+        let priors: Vec<Option<FramePrior>> = frames.iter().map(prior).collect();
         let increments = &increments[rows.clone()];
         let smoothed = smooth(&poses[rows.clone()], &priors, increments, &config.smoothing);
         let marginals = smoothing::covariances(&smoothed, &priors, increments, &config.smoothing);
         if let Some(mut marginals) = marginals {
             // Smoothing cannot reduce the error that the map has in all frames.
-            let variance = config.gauss_newton.map_error_m.powi(2);
-            let of_map = Matrix3::from_diagonal(&Vector3::new(variance, variance, 0.0));
             marginals
                 .iter_mut()
                 .for_each(|covariance| *covariance += of_map);
@@ -678,11 +678,12 @@ impl FrameResult {
         self.state == State::Tracking
     }
 
-    /// Measured pose for smoothing.
-    fn prior(&self) -> Option<FramePrior> {
+    /// Measured pose for smoothing, without the error that the map has in all frames where the covariance contains it.
+    fn prior(&self, of_map: &Matrix3<f64>) -> Option<FramePrior> {
+        let own = self.covariance - of_map;
         self.is_tracked().then_some(FramePrior {
             pose: self.pose,
-            covariance: self.covariance,
+            covariance: own.cholesky().map_or(self.covariance, |_| own),
         })
     }
 

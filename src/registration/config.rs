@@ -1,5 +1,6 @@
 //! Settings of the registration.
 
+use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
@@ -25,19 +26,27 @@ pub struct RegistrationConfig {
     /// Number of azimuth sectors, the clusters of correlated residuals in the covariance.
     #[default(24)]
     pub sectors: usize,
-    /// Standard deviation per axis of an offset common to all visible surfaces [m]; residuals cannot
-    /// show it. The default is a thirtieth of the 9 cm cells of a map: simulated maps are off by 3
-    /// to 4 mm over tens of meters.
-    #[default(0.003)]
+    /// Standard deviation per axis of an offset common to the visible surfaces of the map [m], whose poses were found from scans;
+    /// residuals cannot show it. The default is that of maps of three sensors. A map from exact poses has less than a millimetre.
+    #[default(0.004)]
     pub map_error_m: f64,
     /// Standard deviation of the normals of the map, whose noise is no information on the position [rad]. The default is 3 mm
-    /// over the 9 cm of a cell. It is no key of a configuration.
+    /// over the 0.1 m of a cell. It is no key of a configuration.
     #[default(0.03)]
     #[serde(skip)]
     pub normal_rad: f64,
 }
 
 impl RegistrationConfig {
+    /// Covariance of (x, y, heading) of the error that all poses in a part of the map have in common, in its axes [m², rad²]:
+    /// neither more beams nor more frames reduce it. Surfaces that are off turn a pose, too.
+    pub(crate) fn of_map(&self) -> Matrix3<f64> {
+        /// Distance of the surfaces that show the heading [m].
+        const LEVER_M: f64 = 30.0;
+        let deviations = Vector3::new(1.0, 1.0, 1.0 / LEVER_M) * self.map_error_m;
+        Matrix3::from_diagonal(&deviations.component_mul(&deviations))
+    }
+
     /// The settings for a pose that is not certain, with twice the noise of the normals: where they are noisier than usual,
     /// as on parts of a tunnel or of a motorway, they would confirm a wrong place.
     pub(crate) fn cautious(&self) -> Self {

@@ -11,19 +11,19 @@
 //! association), and the plane of its triangle gives the point-to-plane residual.
 //!
 //! Neighboring returns hit the same surface and share its map error, so their residuals are
-//! correlated. The covariance is cluster-robust: gradients are summed per sector of the azimuth,
-//! and only sectors are taken as independent:
+//! correlated, and only sectors of the azimuth are taken as independent: the covariance is that of the jackknife, by the
+//! shifts of the pose where one of K sectors is left out.
 //!
 //! ```text
-//! Σ = H⁻¹ (σ² H + Σₖ gₖ gₖᵀ) H⁻¹ + M        H = Σ wᵢ Jᵢᵀ Jᵢ,   gₖ = Σ_{i in sector k} wᵢ Jᵢᵀ rᵢ
+//! Σ = σ² H⁻¹ + (K − 1) / K · Σₖ δₖ δₖᵀ        δₖ = (H − Hₖ)⁻¹ gₖ,   Hₖ = Σ wᵢ Jᵢᵀ Jᵢ,   gₖ = Σ wᵢ Jᵢᵀ rᵢ   of sector k
 //! ```
 //!
-//! White, *A Heteroskedasticity-Consistent Covariance Matrix Estimator* (1980), and Liang and Zeger,
-//! *Longitudinal Data Analysis Using Generalized Linear Models* (1986), for sums over clusters. In H of the covariance,
-//! the normals have noise: along a tunnel it would count as information, of W σₙ² for a sum W of weights, which is taken off
-//! each horizontal direction (errors in variables: Fuller, *Measurement Error Models*, 1987). The
-//! first term, the covariance of independent returns, keeps the estimate positive definite when few
-//! sectors have returns; M is the variance of an offset of the whole map. Chen and Medioni, *Object
+//! Efron and Stein, *The Jackknife Estimate of Variance* (1981); Bell and McCaffrey, *Bias Reduction in Standard Errors for
+//! Linear Regression with Multi-Stage Samples* (2002), for its use with clusters of which few determine a parameter. In the
+//! covariance, the normals have noise: along a tunnel it would count as information, of W σₙ² for a sum W of weights, which
+//! is taken off each horizontal direction (errors in variables: Fuller, *Measurement Error Models*, 1987). The first term,
+//! the covariance of independent returns, keeps the estimate positive definite when few sectors have returns. The error that
+//! the map has in all frames is none of it, see [`RegistrationConfig::of_map`]. Chen and Medioni, *Object
 //! Modelling by Registration of Multiple Range Images* (1992), for point to plane; Blais and Levine
 //! (1995) for projective association.
 
@@ -97,6 +97,22 @@ pub(crate) fn register(
         }
     }
     Ok(result)
+}
+
+/// The planar covariance of a pose that stays where it is; `None` if the beams do not determine it.
+pub(crate) fn covariance_at(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    map_from_lidar: &Pose3,
+    config: &RegistrationConfig,
+) -> Result<Option<Matrix3<f64>>, RenderError> {
+    let residuals = linearize(renderer, beams, map_from_lidar, config)?;
+    let result = solve(&residuals, config).map(|(_, covariance)| RegistrationResult {
+        map_from_lidar: *map_from_lidar,
+        covariance,
+        iterations: 0,
+    });
+    Ok(result.as_ref().map(RegistrationResult::planar_covariance))
 }
 
 /// Registers beams in two stages: 2,400 of them, then the 4,800 most informative ones, see [`informative::choose`]; fewer
@@ -211,7 +227,7 @@ fn solve(
     }
     let mut information = Matrix6::zeros();
     let mut right_side = Vector6::zeros();
-    let mut sector_gradients = vec![Vector6::zeros(); config.sectors];
+    let mut sectors = vec![(Matrix6::zeros(), Vector6::zeros()); config.sectors];
     let (mut squares, mut weights) = (0.0, 0.0);
     let kernel = RobustKernel {
         scale_m: config.kernel_m,
@@ -219,26 +235,47 @@ fn solve(
     for residual in residuals {
         let jacobian = residual.jacobian;
         let weight = kernel.weight(residual.value_m);
-        information += weight * jacobian * jacobian.transpose();
+        let of_residual = weight * jacobian * jacobian.transpose();
+        information += of_residual;
         let gradient = weight * residual.value_m * jacobian;
         right_side -= gradient;
-        sector_gradients[residual.sector] += gradient;
+        let sector = &mut sectors[residual.sector];
+        sector.0 += of_residual;
+        sector.1 += gradient;
         squares += weight * residual.value_m.powi(2);
         weights += weight;
     }
     let cholesky = information.cholesky()?;
     let step = cholesky.solve(&right_side);
-    let outer_products: Matrix6<f64> = sector_gradients.iter().map(|g| g * g.transpose()).sum();
     let horizontal = Horizontal::new(&information, weights * config.normal_rad.powi(2))?;
     let inverse = horizontal.corrected(&information).try_inverse()?;
     let step = horizontal.determined(step);
-    let mut covariance = inverse * (squares / weights) + inverse * outer_products * inverse;
-    for axis in 0..3 {
-        covariance[(axis, axis)] += config.map_error_m.powi(2);
-    }
+    let shifts = shifts_without_sectors(&information, &sectors, &inverse)?;
+    let count = shifts.len() as f64;
+    let outer_products: Matrix6<f64> = shifts.iter().map(|it| it * it.transpose()).sum();
+    let covariance = inverse * (squares / weights) + outer_products * ((count - 1.0) / count);
     step.iter()
         .all(|value| value.is_finite())
         .then_some((step, covariance))
+}
+
+/// How far the pose moves, to first order, where each sector that has residuals is left out; `sectors` are their
+/// parts of the information matrix and of the gradient. `None` if the information is singular.
+fn shifts_without_sectors(
+    information: &Matrix6<f64>,
+    sectors: &[(Matrix6<f64>, Vector6<f64>)],
+    inverse: &Matrix6<f64>,
+) -> Option<Vec<Vector6<f64>>> {
+    /// Part of a sector that is left out: without all of it, what it alone determines would be unknown.
+    const PART: f64 = 0.95;
+    let shift = |(of_sector, gradient): &(Matrix6<f64>, Vector6<f64>)| {
+        let rest = (information - PART * of_sector).cholesky()?;
+        Some(inverse * information * rest.solve(gradient))
+    };
+    (sectors.iter())
+        .filter(|(of_sector, _)| of_sector.trace() > 0.0)
+        .map(shift)
+        .collect()
 }
 
 #[cfg(test)]

@@ -132,6 +132,7 @@ impl ParticleFilter {
             height_m: 0.0,
             normal: Vector3::z(),
         };
+        let covariance = covariance + self.config.proposal.registration.of_map();
         Ok(Estimate {
             pose,
             map_from_lidar: self.patch.unwrap_or(level).lift(&pose, attitude),
