@@ -164,7 +164,7 @@ fn the_particles_of_all_frames_may_exceed_the_budget() {
         .set("num_reduced", "400000")
         .set("observation.min_beams", "1")
         .set("observation.ray_budget", "1")
-        .set("proposal.weighed_beams", "1")
+        .set("proposal.compared_beams", "1")
         // One beam confirms no pose.
         .exits_with(3);
 }

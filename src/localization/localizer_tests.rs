@@ -9,8 +9,7 @@ use nalgebra::Vector2;
 use super::*;
 use crate::geometry::TriangleMesh;
 use crate::lidar::LidarModel;
-use crate::localization::ObservationConfig;
-use crate::localization::State;
+use crate::localization::{ObservationConfig, ProposalConfig, State};
 use crate::map::world_for_tests::TestWorld;
 use crate::map::{MapCache, MapOptions, MappingPath, TileConfig, TileGrid};
 use crate::rendering::Backend;
@@ -18,8 +17,11 @@ use crate::rendering::Backend;
 impl LocalizerConfig {
     /// Small enough for a test, else the defaults.
     pub fn of_test(num_particles: usize) -> Self {
+        let mut proposal = ProposalConfig::default();
+        proposal.registration.map_error_m = 0.0;
         Self {
             num_particles,
+            proposal,
             observation: ObservationConfig {
                 beams: 600,
                 min_beams: 150,

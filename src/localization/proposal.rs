@@ -1,20 +1,19 @@
-//! Approximation of the optimal proposal distribution by registration, for a narrow distribution.
+//! Fusion of prediction and registration, for a narrow distribution.
 //!
 //! Particles that are predicted by the odometry alone have the spread of its noise, and most of them are
 //! unlikely given the scan. The scan is therefore registered with the map once for all particles, which
 //! are sampled from the product of prediction and registration:
 //!
 //! ```text
-//! prior      N(m, P)       the predicted particles
-//! scan       N(s, S)       registration of the scan with the map, starting at m
-//! proposal   N(q, k² Q)    Q = (P⁻¹ + S⁻¹)⁻¹,   q = m + Q S⁻¹ (s − m)
-//! weight     w ∝ (p(scan | x, map) N(x; m, P) / N(x; q, k² Q))ᵝ        β: tempering
+//! prior        N(m, P)     the predicted particles
+//! likelihood   N(s, S)     registration of the scan with the map, starting at m
+//! posterior    N(q, Q)     Q = (P⁻¹ + S⁻¹)⁻¹,   q = m + Q S⁻¹ (s − m)
 //! ```
 //!
-//! The registration also estimates height, roll and pitch, which all particles share.
-//! Grisetti, Stachniss and Burgard, *Improved Techniques for Grid Mapping with Rao-Blackwellized
-//! Particle Filters* (2007), section III; Kotecha and Djurić, *Gaussian Particle Filtering* (2003),
-//! for a distribution that is represented by its mean and covariance.
+//! The registration also estimates height, roll and pitch, which all particles share. Kotecha and Djurić, *Gaussian
+//! Particle Filtering* (2003), with the likelihood of the registration, so that no sample has to be weighted; for a
+//! registration as the likelihood of a scan, Grisetti, Stachniss and Burgard, *Improved Techniques for Grid Mapping with
+//! Rao-Blackwellized Particle Filters* (2007), section III.
 
 use nalgebra::{Cholesky, Const, Matrix3, Vector3};
 use rand::{Rng, RngExt as _};
@@ -27,29 +26,29 @@ use crate::geometry::{Pose2, wrap_angle};
 use crate::registration::RegistrationConfig;
 use crate::validation::{InvalidValue, Validate, fraction, in_range, nested};
 
-/// Proposal distribution while tracking.
+/// Update by a registration while tracking.
 ///
 /// Defaults: values of this project.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ProposalConfig {
-    /// Whether the scan is part of the proposal; otherwise the prediction alone is, as in range-mcl.
+    /// Whether particles are sampled where prediction and registration agree; otherwise the predicted ones are weighted, as
+    /// in range-mcl.
     #[default(true)]
     pub scan: bool,
     /// Number of beams that are registered.
-    #[default(2400)]
+    #[default(9600)]
     pub beams: usize,
     /// Largest share of them that end on the road, which determines height, roll and pitch (unitless).
     #[default(0.4)]
     pub road_share: f64,
-    /// Number of beams that weight the particles.
-    #[default(600)]
-    pub weighed_beams: usize,
-    /// Registration of the scan with the map. Sampling and weighting add variance, which covers the
-    /// rest of the map error: with a larger `map_error_m` the covariances of simulated drives are too large. The last
-    /// step is so small that the estimate does not depend on whether there is one more.
-    #[default(RegistrationConfig { map_error_m: 0.001, tolerance_m: 1e-4, ..RegistrationConfig::default() })]
+    /// Number of beams whose agreement with the map is judged at the estimate.
+    #[default(2400)]
+    pub compared_beams: usize,
+    /// Registration of the scan with the map. The last step is so small that the estimate does not depend on whether
+    /// there is one more.
+    #[default(RegistrationConfig { tolerance_m: 1e-4, ..RegistrationConfig::default() })]
     pub registration: RegistrationConfig,
 }
 
@@ -57,7 +56,7 @@ impl Validate for ProposalConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("beams", self.beams, 1..=1_000_000)?;
         fraction("road_share", self.road_share)?;
-        in_range("weighed_beams", self.weighed_beams, 1..=1_000_000)?;
+        in_range("compared_beams", self.compared_beams, 1..=1_000_000)?;
         nested("registration", &self.registration)
     }
 }
@@ -67,8 +66,7 @@ impl Validate for ProposalConfig {
 pub struct Gaussian {
     /// Mean.
     pub mean: Pose2,
-    /// Covariance of (x, y, heading) [m², m·rad, rad²].
-    pub covariance: Matrix3<f64>,
+    /// Of the covariance of (x, y, heading) [m², m·rad, rad²].
     cholesky: Cholesky<f64, Const<3>>,
 }
 
@@ -77,7 +75,6 @@ impl Gaussian {
     pub fn new(mean: Pose2, covariance: Matrix3<f64>) -> Option<Self> {
         Some(Self {
             mean,
-            covariance,
             cholesky: covariance.cholesky()?,
         })
     }
@@ -88,19 +85,18 @@ impl Gaussian {
         offset.dot(&self.cholesky.solve(&offset))
     }
 
-    /// Logarithm of the density, up to a constant.
-    pub fn log_density(&self, pose: &Pose2) -> f64 {
-        -0.5 * self.squared_distance(pose)
-    }
-
-    /// Samples poses.
+    /// Samples poses whose mean and covariance are exactly those of the distribution; of less than four, only the mean.
     pub fn sample(&self, count: usize, rng: &mut impl Rng) -> Vec<Pose2> {
-        let root = self.cholesky.l();
-        let draw = |_| {
-            let deviates = Vector3::from_fn(|_, _| rng.sample(StandardNormal));
-            shifted(&self.mean, &(root * deviates))
-        };
-        (0..count).map(draw).collect()
+        let draw = |_| Vector3::from_fn(|_, _| rng.sample::<f64, _>(StandardNormal));
+        let mut deviates: Vec<Vector3<f64>> = (0..count).map(draw).collect();
+        let mean = deviates.iter().sum::<Vector3<f64>>() / count.max(1) as f64;
+        deviates.iter_mut().for_each(|deviate| *deviate -= mean);
+        let squares: Matrix3<f64> = deviates.iter().map(|it| it * it.transpose()).sum();
+        let of_deviates = (squares / count as f64).cholesky().filter(|_| count > 3);
+        let whiten = of_deviates.and_then(|it| it.l().try_inverse());
+        let root = self.cholesky.l() * whiten.unwrap_or_else(Matrix3::identity);
+        let pose = |deviate: &Vector3<f64>| shifted(&self.mean, &(root * deviate));
+        deviates.iter().map(pose).collect()
     }
 
     /// Normalized product with another one.
@@ -109,11 +105,6 @@ impl Gaussian {
         let covariance = information.cholesky()?.inverse();
         let weighted = other.cholesky.solve(&deviation(&other.mean, &self.mean));
         Self::new(shifted(&self.mean, &(covariance * weighted)), covariance)
-    }
-
-    /// Scales the standard deviations.
-    pub fn widened(&self, factor: f64) -> Option<Self> {
-        Self::new(self.mean, self.covariance * factor.powi(2))
     }
 }
 
@@ -146,6 +137,11 @@ mod tests {
         Gaussian::new(mean, Matrix3::from_diagonal(&variances)).unwrap()
     }
 
+    fn covariance(gaussian: &Gaussian) -> Matrix3<f64> {
+        let root = gaussian.cholesky.l();
+        root * root.transpose()
+    }
+
     #[test]
     fn the_product_of_equal_gaussians_has_the_average_mean_and_half_the_covariance() {
         let (a, b) = (gaussian(0.0, 3.1, 0.2), gaussian(1.0, -3.1, 0.2));
@@ -153,7 +149,7 @@ mod tests {
         assert_relative_eq!(fused.mean.translation.x, 0.5, epsilon = 1e-9);
         let heading = fused.mean.rotation.angle().abs();
         assert_relative_eq!(heading, std::f64::consts::PI, epsilon = 1e-9);
-        assert_relative_eq!(fused.covariance, 0.5 * a.covariance, epsilon = 1e-12);
+        assert_relative_eq!(covariance(&fused), 0.5 * covariance(&a), epsilon = 1e-12);
     }
 
     #[test]
@@ -162,38 +158,42 @@ mod tests {
         let wide = gaussian(9.0, 2.0, 1e6);
         let fused = narrow.fused(&wide).unwrap();
         assert_relative_eq!(fused.mean, narrow.mean, epsilon = 1e-9);
-        assert_relative_eq!(fused.covariance, narrow.covariance, epsilon = 1e-9);
+        assert_relative_eq!(covariance(&fused), covariance(&narrow), epsilon = 1e-9);
     }
 
     #[test]
-    fn samples_have_the_covariance_of_their_gaussian() {
-        let gaussian = gaussian(2.0, 1.0, 0.3);
-        let count = 20_000;
-        let poses = gaussian.sample(count, &mut StdRng::seed_from_u64(1));
-        let particles = ParticleSet::uniform(poses);
-        let found = particles.covariance_about(&gaussian.mean);
-        let error = 4.0 * (2.0 / count as f64).sqrt();
-        assert_relative_eq!(found, gaussian.covariance, epsilon = error * 0.36);
-        for axis in 0..3 {
-            let expected = gaussian.covariance[(axis, axis)];
-            assert_relative_eq!(found[(axis, axis)], expected, max_relative = error);
+    fn samples_have_exactly_the_mean_and_the_covariance_of_their_gaussian() {
+        let gaussian = gaussian(2.0, 3.1, 0.03)
+            .fused(&gaussian(2.1, -3.1, 0.02))
+            .unwrap();
+        for count in [4, 5, 100] {
+            let poses = gaussian.sample(count, &mut StdRng::seed_from_u64(1));
+            assert_eq!(poses.len(), count);
+            let particles = ParticleSet::uniform(poses);
+            let mean = particles.mean();
+            let off = deviation(&mean, &gaussian.mean);
+            assert_relative_eq!(off, Vector3::zeros(), epsilon = 1e-6);
+            let found = particles.covariance_about(&mean);
+            assert_relative_eq!(
+                found,
+                covariance(&gaussian),
+                max_relative = 1e-3,
+                epsilon = 1e-9
+            );
         }
     }
 
     #[test]
-    fn importance_weights_recover_the_prior_from_the_proposal() {
-        let prior = gaussian(1.0, 0.0, 0.2);
-        let proposal = gaussian(1.1, 0.0, 0.4);
-        let poses = proposal.sample(50_000, &mut StdRng::seed_from_u64(2));
-        let mut particles = ParticleSet::uniform(poses);
-        let ratios: Vec<f64> = particles
-            .poses()
-            .map(|pose| prior.log_density(pose) - proposal.log_density(pose))
-            .collect();
-        particles.reweight(&ratios);
-        assert_relative_eq!(particles.mean().translation.x, 1.0, epsilon = 0.01);
-        let spread = particles.covariance_about(&prior.mean)[(0, 0)].sqrt();
-        assert_relative_eq!(spread, 0.2, epsilon = 0.01);
+    fn few_samples_have_the_mean_of_their_gaussian() {
+        let gaussian = gaussian(2.0, 1.0, 0.03);
+        for count in [0, 1, 2, 3] {
+            let poses = gaussian.sample(count, &mut StdRng::seed_from_u64(1));
+            assert_eq!(poses.len(), count);
+            if count > 0 {
+                let mean = ParticleSet::uniform(poses).mean();
+                assert_relative_eq!(mean, gaussian.mean, epsilon = 1e-4);
+            }
+        }
     }
 
     #[test]

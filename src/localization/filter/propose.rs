@@ -1,5 +1,5 @@
-//! Particles of a narrow distribution: sampled where odometry and scan agree
-//! ([`proposal`](crate::localization::proposal)) and weighted by importance.
+//! Particles of a narrow distribution: sampled from the product of prediction and registration
+//! ([`proposal`](crate::localization::proposal)).
 
 use rand::Rng;
 
@@ -8,28 +8,23 @@ use super::reweight::Update;
 use super::state::ParticleFilter;
 use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
-use crate::localization::observation::choose_beams;
+use crate::localization::observation::{choose_beams, costs_of_scan};
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::SensorAttitude;
-use crate::registration::register;
+use crate::registration::{register, register_informative};
 use crate::rendering::RenderError;
 
-/// Factor k of the standard deviations of the proposal, at least 1, so that its tails are heavier than those of the
-/// target (unitless).
-const WIDENING: f64 = 1.5;
 /// Distance from the prior beyond which a registration is rejected (standard deviations).
 const MAX_SIGMAS: f64 = 6.0;
 
-/// Proposal distribution of a frame, with what is needed to weight its samples.
-pub(super) struct Proposal {
-    prior: Gaussian,
-    /// Already widened.
-    proposal: Gaussian,
+/// Distribution of the pose of a frame, given prediction and scan.
+pub(super) struct Posterior {
+    gaussian: Gaussian,
+    /// Beams that are compared with the map there.
     beams: Vec<Beam>,
-    /// Beams that weight the samples. Not every n-th of `beams`: one more or less there would change them all.
-    weighed_beams: Vec<Beam>,
+    mean_cost_m: Option<f64>,
     /// Height of the ground [m].
     level_m: f64,
     attitude: SensorAttitude,
@@ -52,7 +47,8 @@ impl ParticleFilter {
         let Some(patch) = patch.filter(|_| self.phase.is_tracking()) else {
             return Ok(None);
         };
-        let beams = choose_beams(scan, config.beams, config.road_share, attitude, rng);
+        let count = config.compared_beams;
+        let beams = choose_beams(scan, count, config.road_share, attitude, rng);
         let start = patch.lift(&predicted, attitude);
         let found = register(&*self.map.renderer, &beams, &start, &config.registration)?;
         Ok(found.map(|found| found.map_from_lidar))
@@ -65,7 +61,7 @@ impl ParticleFilter {
         scan: &RangeImage,
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
-    ) -> Result<Option<Proposal>, RenderError> {
+    ) -> Result<Option<Posterior>, RenderError> {
         let config = &self.config.proposal;
         if !config.scan || !self.phase.is_tracking() {
             return Ok(None);
@@ -75,13 +71,14 @@ impl ParticleFilter {
             return Ok(None);
         };
         let mut choose = |count| choose_beams(scan, count, config.road_share, attitude, rng);
-        let (beams, weighed_beams) = (choose(config.beams), choose(config.weighed_beams));
+        let (registered, beams) = (choose(config.beams), choose(config.compared_beams));
         let start = patch.lift(&mean, attitude);
         let registration = match self.phase {
             Phase::Tracking => &config.registration,
             _ => &config.registration.cautious(),
         };
-        let Some(found) = register(&*self.map.renderer, &beams, &start, registration)? else {
+        let renderer = &*self.map.renderer;
+        let Some(found) = register_informative(renderer, &registered, &start, registration)? else {
             return Ok(None);
         };
         let prior = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)));
@@ -93,127 +90,119 @@ impl ParticleFilter {
         if prior.squared_distance(&measured.mean) > MAX_SIGMAS.powi(2) {
             return Ok(None);
         }
-        let fused = prior.fused(&measured);
-        Ok(fused
-            .and_then(|fused| fused.widened(WIDENING))
-            .map(|proposal| Proposal {
-                prior,
-                proposal,
-                beams,
-                weighed_beams,
-                level_m: patch.height_m,
-                attitude: patch.attitude_of(&found.map_from_lidar),
-            }))
+        let Some(gaussian) = prior.fused(&measured) else {
+            return Ok(None);
+        };
+        let attitude = patch.attitude_of(&found.map_from_lidar);
+        let pose = Some(patch.lift(&gaussian.mean, &attitude));
+        let observation = &self.config.observation;
+        let costs_m = costs_of_scan(renderer, &[pose], (scan, &beams), observation)?;
+        Ok(Some(Posterior {
+            gaussian,
+            beams,
+            mean_cost_m: costs_m[0],
+            level_m: patch.height_m,
+            attitude,
+        }))
     }
 
-    /// Samples the particles from a proposal and weights them by the likelihood of the scan and by the
-    /// ratio of prediction to proposal (importance sampling).
-    pub(super) fn sample_and_weight(
-        &mut self,
-        proposal: Proposal,
-        scan: &RangeImage,
-        rng: &mut impl Rng,
-    ) -> Result<Update, RenderError> {
-        let Proposal {
-            prior,
-            proposal,
-            beams,
-            weighed_beams,
-            level_m,
-            attitude,
-        } = proposal;
-        let poses = proposal.sample(self.config.num_reduced, rng);
-        let particle = |pose| Particle::new(pose, Some(level_m));
+    /// Samples the particles from a posterior.
+    pub(super) fn sample(&mut self, posterior: Posterior, rng: &mut impl Rng) -> Update {
+        let poses = posterior.gaussian.sample(self.config.num_reduced, rng);
+        let particle = |pose| Particle::new(pose, Some(posterior.level_m));
         self.particles = ParticleSet::uniform(poses.into_iter().map(particle));
-        let (mut logs, costs_m) = self.log_likelihoods((scan, &weighed_beams), &attitude)?;
-        for (log, pose) in logs.iter_mut().zip(self.particles.poses()) {
-            *log += prior.log_density(pose) - proposal.log_density(pose);
-        }
-        self.reweight(&logs, 1.0);
-        Ok(Update {
-            costs_m,
-            beams,
-            attitude,
+        Update {
+            mean_cost_m: posterior.mean_cost_m,
+            beams: posterior.beams,
+            attitude: posterior.attitude,
             place: None,
-        })
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use approx::assert_relative_eq;
-    use nalgebra::{Matrix3, Vector3};
+    use nalgebra::Vector3;
     use rand::{SeedableRng as _, rngs::StdRng};
 
     use super::*;
     use crate::geometry::Pose2;
     use crate::localization::LocalizerConfig;
     use crate::localization::particles::deviation;
-    use crate::map::gaussian_for_tests::GaussianWorld;
     use crate::map::world_for_tests::TestWorld;
 
-    fn gaussian(mean: [f64; 3], deviations: [f64; 3], correlation: f64) -> Gaussian {
-        let scale = Matrix3::from_diagonal(&Vector3::from(deviations));
-        let mut shape = Matrix3::identity();
-        (shape[(0, 1)], shape[(1, 0)]) = (correlation, correlation);
-        let mean = Pose2::new(nalgebra::Vector2::new(mean[0], mean[1]), mean[2]);
-        Gaussian::new(mean, scale * shape * scale).unwrap()
+    /// A filter that tracks, with particles of a distribution.
+    fn tracking(world: &TestWorld, prior: &Gaussian, rng: &mut StdRng) -> ParticleFilter {
+        let particles = ParticleSet::uniform(prior.sample(100, rng));
+        let config = LocalizerConfig::of_test(100);
+        let mut filter = ParticleFilter::new(config, world.map(), None, particles).unwrap();
+        filter.phase = Phase::Tracking;
+        filter
     }
 
     #[test]
-    fn samples_represent_the_prior_times_the_likelihood() {
-        const COUNT: usize = 20_000;
-        let street = TestWorld::street();
-        let prior = gaussian([5.0, 0.3, 0.1], [0.04, 0.03, 0.004], 0.5);
-        let likelihood = gaussian([5.03, 0.28, 0.104], [0.05, 0.03, 0.004], -0.3);
-        // The proposal knows the likelihood of the scan approximately, as a registration does.
-        let registration = gaussian([5.025, 0.285, 0.103], [0.04, 0.03, 0.003], 0.0);
-        let proposal = prior.fused(&registration).unwrap();
-        let config = LocalizerConfig {
-            num_reduced: COUNT,
-            ..LocalizerConfig::default()
-        };
-        let mut map = street.map();
-        map.renderer = Arc::new(GaussianWorld {
-            mean: likelihood.mean,
-            information: likelihood.covariance.try_inverse().unwrap(),
-            scale_m: config.observation.scale_m,
-        });
-        let start = ParticleSet::uniform([prior.mean]);
-        let mut filter = ParticleFilter::new(config, map, None, start).unwrap();
-        let proposed = Proposal {
-            prior: prior.clone(),
-            proposal: proposal.widened(WIDENING).unwrap(),
-            beams: Vec::new(),
-            weighed_beams: Vec::new(),
-            level_m: -1.73,
-            attitude: SensorAttitude::default(),
-        };
-        let scan = street.scan(&prior.mean);
+    fn particles_represent_the_product_of_prediction_and_registration() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
         let mut rng = StdRng::seed_from_u64(1);
-        filter.sample_and_weight(proposed, &scan, &mut rng).unwrap();
+        // As certain as the registration, and off by five of its standard deviations.
+        let sigmas = Vector3::new(2e-3, 1e-3, 1e-4);
+        let mean = truth * Pose2::new(nalgebra::Vector2::new(0.01, -0.005), 5e-4);
+        let covariance = nalgebra::Matrix3::from_diagonal(&sigmas.component_mul(&sigmas));
+        let prior = Gaussian::new(mean, covariance).unwrap();
+        let mut filter = tracking(&world, &prior, &mut rng);
+        let scan = world.scan(&truth);
+        let attitude = SensorAttitude::default();
 
-        let exact = prior.fused(&likelihood).unwrap();
-        // Five standard errors of a mean and of a variance from so many effective particles.
-        let effective = filter.particles.effective_sample_size();
-        let error = 5.0 / effective.sqrt();
-        let found = Gaussian::new(
-            filter.particles.mean(),
-            filter.particles.covariance_about(&filter.particles.mean()),
-        )
-        .unwrap();
-        let off = deviation(&found.mean, &exact.mean);
-        for axis in 0..3 {
-            let sigma = exact.covariance[(axis, axis)].sqrt();
-            assert_relative_eq!(off[axis] / sigma, 0.0, epsilon = error);
-            let ratio = found.covariance[(axis, axis)] / sigma.powi(2);
-            assert_relative_eq!(ratio, 1.0, epsilon = error * 2.0_f64.sqrt());
-        }
-        let shape = |it: &Gaussian| {
-            it.covariance[(0, 1)] / (it.covariance[(0, 0)] * it.covariance[(1, 1)]).sqrt()
+        let config = &filter.config.proposal;
+        let mut same = rng.clone();
+        let (count, road_share) = (config.beams, config.road_share);
+        let beams = choose_beams(&scan, count, road_share, &attitude, &mut same);
+        let start = filter.patch_at(&mean).unwrap().unwrap();
+        let start = start.lift(&mean, &attitude);
+        let registration = &config.registration;
+        let found = register_informative(&world, &beams, &start, registration).unwrap();
+        let found = found.unwrap();
+        let measured = found.planar_covariance().try_inverse().unwrap();
+        let information = regular(&covariance).try_inverse().unwrap() + measured;
+        let expected = information.try_inverse().unwrap();
+        let off = deviation(&pose2_from_pose3(&found.map_from_lidar), &mean);
+        let shift = expected * measured * off;
+
+        let posterior = filter.propose(&scan, &attitude, &mut rng).unwrap().unwrap();
+        filter.sample(posterior, &mut rng);
+        let pose = filter.particles.mean();
+        assert_eq!(filter.particles.len(), filter.config.num_reduced);
+        assert_relative_eq!(deviation(&pose, &mean), shift, epsilon = 1e-6);
+        let covariance = filter.particles.covariance_about(&pose);
+        assert_relative_eq!(covariance, expected, max_relative = 0.01, epsilon = 1e-10);
+    }
+
+    #[test]
+    fn the_covariance_of_an_estimate_contains_the_error_of_the_map_once() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let covariance_after = |map_error_m: f64, frames: usize| {
+            let mut rng = StdRng::seed_from_u64(1);
+            let covariance = nalgebra::Matrix3::identity() * 1e-6;
+            let prior = Gaussian::new(truth, covariance).unwrap();
+            let mut filter = tracking(&world, &prior, &mut rng);
+            filter.config.proposal.registration.map_error_m = map_error_m;
+            let scan = world.scan(&truth);
+            let attitude = SensorAttitude::default();
+            let frames = (0..frames).map(|_| {
+                let frame = filter.step(Odometry::Unknown, &scan, &attitude, &mut rng);
+                frame.unwrap().covariance
+            });
+            frames.last().unwrap()
         };
-        assert_relative_eq!(shape(&found), shape(&exact), epsilon = error);
+        for frames in [1, 5] {
+            let without = covariance_after(0.0, frames);
+            let with = covariance_after(0.03, frames);
+            let of_map = Vector3::new(9e-4, 9e-4, 0.0);
+            let expected = nalgebra::Matrix3::from_diagonal(&of_map);
+            assert_relative_eq!(with - without, expected, epsilon = 1e-12);
+        }
     }
 }

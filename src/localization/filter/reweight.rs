@@ -14,8 +14,8 @@ use crate::rendering::RenderError;
 
 /// Result of a measurement update.
 pub(super) struct Update {
-    /// Mean costs of the particles [m]; `None` off the map.
-    pub(super) costs_m: Vec<Option<f64>>,
+    /// Mean cost of the beams [m]; `None` off the map.
+    pub(super) mean_cost_m: Option<f64>,
     /// The beams of the last round.
     pub(super) beams: Vec<Beam>,
     /// Attitude of the sensor as estimated in this frame.
@@ -65,7 +65,7 @@ impl ParticleFilter {
             power += used;
             if round >= rounds || power >= 1.0 || used <= 0.0 {
                 return Ok(Update {
-                    costs_m,
+                    mean_cost_m: weighted_mean(&self.particles, &costs_m),
                     beams,
                     attitude: self.refined_attitude(scan, attitude)?,
                     place: None,
@@ -113,7 +113,7 @@ impl ParticleFilter {
         let particles = self.particles.clone();
         let mut estimate = self.estimate_of(pose, particles, covariance, &update.attitude)?;
         estimate.updated = true;
-        estimate.mean_cost_m = weighted_mean(&self.particles, &update.costs_m);
+        estimate.mean_cost_m = update.mean_cost_m;
         let is_narrow = self.is_narrow();
         // A jump of a wide distribution is not a motion of the car.
         if self.updated.is_narrow && is_narrow {

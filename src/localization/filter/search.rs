@@ -79,14 +79,19 @@ impl ParticleFilter {
             return Ok(None);
         };
         let attitude = places[best].patch.attitude_of(&places[best].map_from_lidar);
-        let costs_m = self.sample_places(&places, &weights, &costs_m, rng);
+        let mean_cost_m = weights
+            .iter()
+            .zip(&costs_m)
+            .map(|(weight, cost_m)| weight * cost_m);
+        let mean_cost_m = Some(mean_cost_m.sum::<f64>() / weights.iter().sum::<f64>());
+        self.sample_places(&places, &weights, rng);
         let likely = weights
             .iter()
             .filter(|&&weight| weight >= config.likely_weight)
             .count();
         self.phase.set_search(Search::Places { likely });
         Ok(Some(Update {
-            costs_m,
+            mean_cost_m,
             beams,
             attitude,
             place: Some(*places[best].pose()),
@@ -185,21 +190,14 @@ impl ParticleFilter {
         weights
     }
 
-    /// Samples the particles of the places, in proportion to their weights and at least a few for each; returns
-    /// the costs of the particles [m].
-    fn sample_places(
-        &mut self,
-        places: &[&PlaceHypothesis],
-        weights: &[f64],
-        costs_m: &[f64],
-        rng: &mut impl Rng,
-    ) -> Vec<Option<f64>> {
+    /// Samples the particles of the places, in proportion to their weights and at least a few for each.
+    fn sample_places(&mut self, places: &[&PlaceHypothesis], weights: &[f64], rng: &mut impl Rng) {
         /// An unlikely place keeps this part of the particles with which one pose is tracked.
         const LEAST_DIVISOR: usize = 4;
         let most = self.config.num_reduced;
         let least = most.div_ceil(LEAST_DIVISOR);
-        let (mut particles, mut costs) = (Vec::new(), Vec::new());
-        for ((place, &weight), &cost_m) in places.iter().zip(weights).zip(costs_m) {
+        let mut particles = Vec::new();
+        for (place, &weight) in places.iter().zip(weights) {
             if weight == 0.0 {
                 continue;
             }
@@ -209,10 +207,8 @@ impl ParticleFilter {
                 weight: weight / count as f64,
                 ..Particle::new(pose, Some(place.patch.height_m))
             }));
-            costs.extend(std::iter::repeat_n(Some(cost_m), count));
         }
         self.particles = ParticleSet::weighted(particles);
-        costs
     }
 }
 

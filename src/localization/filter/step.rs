@@ -34,7 +34,7 @@ impl ParticleFilter {
         }
         self.propagate(odometry, rng);
         let update = match self.propose(scan, attitude, rng)? {
-            Some(proposal) => self.sample_and_weight(proposal, scan, rng)?,
+            Some(posterior) => self.sample(posterior, rng),
             None => self.reweight_widely(scan, attitude, rng)?,
         };
         let mut estimate = self.updated_estimate(&update)?;
@@ -96,7 +96,13 @@ impl ParticleFilter {
     ) -> Result<Option<Estimate>, RenderError> {
         let mut coasted = self.coast(odometry, attitude)?;
         let config = &self.config.proposal;
-        let beams = choose_beams(scan, config.weighed_beams, config.road_share, attitude, rng);
+        let beams = choose_beams(
+            scan,
+            config.compared_beams,
+            config.road_share,
+            attitude,
+            rng,
+        );
         coasted.agreement = self.agreement_at(&coasted.map_from_lidar, &beams, attitude)?;
         let (agreement, config) = (coasted.agreement, &self.config.tracking_loss);
         let contradicts = agreement.is_some_and(|share| share < config.min_agreement)
