@@ -1,10 +1,12 @@
 //! The path and the sensor of the mapping drive, and the frame of the map, stored with the map.
 //!
-//! In the PLY file they are comments, which all mesh readers skip: one for the sensor and one for the place on the Earth, as
-//! JSON, one for the frame, and one per pose, each a translation [m] and a unit quaternion with all digits, so that reading gives the same bits.
+//! In the PLY file they are comments, which all mesh readers skip: the sensor and the place on the Earth as JSON, in lines that belong
+//! together, one for the frame, and one per pose, each a translation [m] and a unit quaternion with all digits, so that reading gives the
+//! same bits. No line is as long as 1024 bytes, which RPly, the reader of Open3D and others, cannot read.
 //!
 //! ```text
 //! comment fpmcl sensor           {"range_image":{"height":64, ...
+//! comment fpmcl sensor           "has_rows":true, ...
 //! comment fpmcl world_from_map   tx ty tz qx qy qz qw
 //! comment fpmcl georeference     {"latitude_deg":49.011, ...
 //! comment fpmcl map_from_lidar   tx ty tz qx qy qz qw
@@ -54,9 +56,9 @@ impl MappingPath {
         let georeference = self.georeference.iter().flat_map(serde_json::to_string);
         let poses = self.map_from_lidar.iter().map(|pose| line(POSE, pose));
         sensor
-            .map(|json| format!("{SENSOR}{json}"))
+            .flat_map(|json| lines(SENSOR, &json))
             .chain(std::iter::once(line(WORLD, &self.world_from_map)))
-            .chain(georeference.map(|json| format!("{GEOREFERENCE}{json}")))
+            .chain(georeference.flat_map(|json| lines(GEOREFERENCE, &json)))
             .chain(poses)
             .collect()
     }
@@ -82,6 +84,7 @@ impl MappingPath {
         comments: impl IntoIterator<Item = &'a str>,
     ) -> Result<Option<Self>, BadPathComment> {
         let mut path: Option<Self> = None;
+        let [mut of_sensor, mut of_earth] = [String::new(), String::new()];
         for comment in comments {
             if let Some(numbers) = comment.strip_prefix(WORLD) {
                 path.get_or_insert_default().world_from_map = pose(numbers, comment)?;
@@ -89,17 +92,41 @@ impl MappingPath {
                 let path = path.get_or_insert_default();
                 path.map_from_lidar.push(pose(numbers, comment)?);
             } else if let Some(json) = comment.strip_prefix(GEOREFERENCE) {
-                path.get_or_insert_default().georeference = georeference(json);
+                of_earth.push_str(json);
             } else if let Some(json) = comment.strip_prefix(SENSOR) {
-                let sensor = serde_json::from_str(json);
-                let sensor = sensor.inspect_err(|error| {
-                    tracing::warn!("the sensor of the map is not read: {error}");
-                });
-                path.get_or_insert_default().sensor = sensor.ok();
+                of_sensor.push_str(json);
             }
+        }
+        if !of_earth.is_empty() {
+            path.get_or_insert_default().georeference = georeference(&of_earth);
+        }
+        if !of_sensor.is_empty() {
+            let sensor = serde_json::from_str(&of_sensor);
+            let sensor = sensor.inspect_err(|error| {
+                tracing::warn!("the sensor of the map is not read: {error}");
+            });
+            path.get_or_insert_default().sensor = sensor.ok();
         }
         Ok(path)
     }
+}
+
+/// Comments with the parts of a JSON text, which end after commas.
+fn lines(key: &str, json: &str) -> Vec<String> {
+    /// Length of a part, if its last item ends there [bytes].
+    const PART: usize = 500;
+    let mut parts = vec![key.to_owned()];
+    for item in json.split_inclusive(',') {
+        let is_full = parts.last().is_some_and(|part| part.len() > PART);
+        if is_full {
+            parts.push(key.to_owned());
+        }
+        parts
+            .last_mut()
+            .into_iter()
+            .for_each(|part| part.push_str(item));
+    }
+    parts
 }
 
 /// The place of a map on the Earth; `None`, with a warning, where it cannot be read.
@@ -210,6 +237,29 @@ mod tests {
         let others = ["made by hand", "fpmcl"];
         let lines = comments.iter().map(String::as_str).chain(others);
         assert_eq!(MappingPath::from_comments(lines).unwrap(), Some(path()));
+    }
+
+    #[test]
+    fn no_comment_is_too_long_for_other_readers_and_parts_belong_together() {
+        let mut path = path();
+        let sensor = path.sensor.as_mut().unwrap();
+        let elevations = (0..128).map(|beam| 1.0 / (beam as f32 + 0.3));
+        sensor.range_image.height = 128;
+        sensor.range_image.elevations = Some(elevations.collect());
+        let comments = path.to_comments();
+        assert!(comments.iter().all(|it| it.len() < 1000), "{comments:?}");
+        let parts = comments.iter().filter(|it| it.starts_with(SENSOR));
+        assert!(parts.count() > 2);
+        let lines = comments.iter().map(String::as_str);
+        assert_eq!(
+            MappingPath::from_comments(lines).unwrap().as_ref(),
+            Some(&path)
+        );
+        // One line, as it was before.
+        let joined = serde_json::to_string(&path.sensor).unwrap();
+        let line = format!("{SENSOR}{joined}");
+        let read = MappingPath::from_comments([line.as_str()]).unwrap();
+        assert_eq!(read.unwrap().sensor, path.sensor);
     }
 
     #[test]
