@@ -22,6 +22,8 @@ const LOCALIZATION: &str = "\
 result_path: results/localization.npz
 numParticles: 500
 plot_loc_results: False
+# The map is from exact poses.
+proposal.registration.map_error_m: 0
 force: True
 ";
 

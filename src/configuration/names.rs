@@ -42,12 +42,12 @@ const REMOVED: [&str; 12] = [
     "basin_m",
     "basin_rad",
     "freedom",
-    "independent_share",
     "max_sigmas",
     "min_incidence",
     "minima",
     "period_s",
     "refined_share",
+    "refinement.scale_m",
     "tracking_rounds",
     "weighed_beams",
     "widening",
@@ -84,12 +84,15 @@ impl Names {
         if name.len() > LONGEST_NAME {
             return Meaning::Unknown;
         }
-        let last = name.rsplit('.').next().unwrap_or(name);
+        let is_it = |removed: &&str| {
+            let before = name.strip_suffix(*removed);
+            before.is_some_and(|before| before.is_empty() || before.ends_with('.'))
+        };
         let dots = name.rmatch_indices('.').map(|(dot, _)| dot);
         for end in std::iter::once(name.len()).chain(dots) {
             match self.key(&name[..end]) {
                 Meaning::Key(key) => return Meaning::Key(key + &name[end..]),
-                Meaning::Unknown if REMOVED.contains(&last) => return Meaning::Removed,
+                Meaning::Unknown if REMOVED.iter().any(is_it) => return Meaning::Removed,
                 Meaning::Unknown => (),
                 other => return other,
             }

@@ -51,7 +51,7 @@ pub struct LocalizerConfig {
     pub tempering: TemperingConfig,
     /// Search among several places.
     pub places: PlacesConfig,
-    /// Proposal distribution while tracking.
+    /// Update by a registration while tracking.
     pub proposal: ProposalConfig,
     /// Resampling.
     pub resampling: ResamplingConfig,

@@ -37,13 +37,14 @@ pub struct ProposalConfig {
     /// in range-mcl.
     #[default(true)]
     pub scan: bool,
-    /// Number of beams that are registered.
+    /// Number of beams, of which the 4,800 most informative ones are registered, or all if these are fewer.
     #[default(9600)]
     pub beams: usize,
     /// Largest share of them that end on the road, which determines height, roll and pitch (unitless).
     #[default(0.4)]
     pub road_share: f64,
-    /// Number of beams whose agreement with the map is judged at the estimate.
+    /// Number of beams whose agreement with the map is judged at the estimate, and that are registered for the motion during
+    /// the sweep.
     #[default(2400)]
     pub compared_beams: usize,
     /// Registration of the scan with the map. The last step is so small that the estimate does not depend on whether
@@ -66,7 +67,7 @@ impl Validate for ProposalConfig {
 pub struct Gaussian {
     /// Mean.
     pub mean: Pose2,
-    /// Of the covariance of (x, y, heading) [m², m·rad, rad²].
+    /// Cholesky factor of the covariance of (x, y, heading) [m², m·rad, rad²].
     cholesky: Cholesky<f64, Const<3>>,
 }
 

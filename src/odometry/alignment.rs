@@ -6,7 +6,7 @@
 //!
 //! H, b are the sums of the points on planes, H', b' those of the others, α is the share of the points on planes (GenZ-ICP,
 //! eq. 11), P the covariance of the prediction, scaled to the variance of the residuals. The scale of the kernel falls to that of the
-//! residuals. The covariance is cluster-robust over sectors of the azimuth, as in [`crate::registration`].
+//! residuals. The covariance is cluster-robust over sectors of the azimuth (White 1980; Liang and Zeger 1986).
 
 use nalgebra::{Matrix6, Vector6};
 

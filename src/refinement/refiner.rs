@@ -340,14 +340,12 @@ fn finish(
 
 #[cfg(test)]
 mod tests {
-    use approx::assert_relative_eq;
     use nalgebra::Vector2;
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
     use crate::geometry::Vec3;
     use crate::lidar::{LidarModel, RangeImage};
-    use crate::map::gaussian_for_tests::GaussianWorld;
     use crate::map::world_for_tests::TestWorld;
     use crate::registration::register;
     use crate::rendering::{RangeDifference, RangeRenderer, SurfaceHit};
@@ -543,13 +541,8 @@ mod tests {
             ..FrameRefinementConfig::default()
         };
         // The costs are least at the estimate, from which the surfaces lead away.
-        let ranges = GaussianWorld {
-            mean: truth,
-            information: Matrix3::from_diagonal(&Vector3::new(400.0, 400.0, 1e5)),
-            scale_m: 0.001,
-        };
         let renderer = Astray {
-            ranges: &ranges,
+            ranges: &world,
             surfaces: TestWorld::moved_street(Pose2::translation(0.08, 0.06)),
         };
         let objective = FrameObjective {

@@ -680,10 +680,11 @@ impl FrameResult {
 
     /// Measured pose for smoothing, without the error that the map has in all frames where the covariance contains it.
     fn prior(&self, of_map: &Matrix3<f64>) -> Option<FramePrior> {
-        let own = self.covariance - of_map;
+        let own = self.is_refined().then_some(self.covariance - of_map);
+        let own = own.filter(|own| own.cholesky().is_some());
         self.is_tracked().then_some(FramePrior {
             pose: self.pose,
-            covariance: own.cholesky().map_or(self.covariance, |_| own),
+            covariance: own.unwrap_or(self.covariance),
         })
     }
 
@@ -772,13 +773,15 @@ mod tests {
         let covariances = |map_error_m: f64| {
             let mut config = RefinerConfig::default();
             config.refinement.gauss_newton.map_error_m = map_error_m;
+            let of_map = config.refinement.gauss_newton.of_map();
+            let own = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6));
             let mut refiner = TrajectoryRefiner::new(&map, &sensor(), config, 0).unwrap();
             for row in 0..20 {
                 let pose = Pose2::translation(f64::from(row), 0.0);
                 refiner.frames.push(FrameResult {
                     pose,
                     map_from_lidar: Some(pose3_from_pose2(&pose, 0.0)),
-                    covariance: Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6)),
+                    covariance: own + of_map,
                     state: State::Tracking,
                     change: None,
                     attitude: SensorAttitude::default(),
@@ -789,7 +792,7 @@ mod tests {
             refiner.finish(Some(&increments)).unwrap().covariances
         };
         let [small, large] = [0.01, 0.03].map(covariances);
-        let expected = Matrix3::from_diagonal(&Vector3::new(8e-4, 8e-4, 0.0));
+        let expected = Matrix3::from_diagonal(&Vector3::new(8e-4, 8e-4, 8e-4 / 900.0));
         for (small, large) in small.iter().zip(&large) {
             assert_relative_eq!(large - small, expected, epsilon = 1e-12);
         }

@@ -26,8 +26,8 @@ pub struct RegistrationConfig {
     /// Number of azimuth sectors, the clusters of correlated residuals in the covariance.
     #[default(24)]
     pub sectors: usize,
-    /// Standard deviation per axis of an offset common to the visible surfaces of the map [m], whose poses were found from scans;
-    /// residuals cannot show it. The default is that of maps of three sensors. A map from exact poses has less than a millimetre.
+    /// Standard deviation per axis of the error that the visible surfaces of a map from estimated poses have in common [m];
+    /// residuals cannot show it. The default is that of maps of three sensors; a map from exact poses has less than a millimetre.
     #[default(0.004)]
     pub map_error_m: f64,
     /// Standard deviation of the normals of the map, whose noise is no information on the position [rad]. The default is 3 mm
@@ -62,7 +62,7 @@ impl Validate for RegistrationConfig {
         in_range("iterations", self.iterations, 1..=1000)?;
         positive("kernel_m", self.kernel_m)?;
         not_negative("tolerance_m", self.tolerance_m)?;
-        in_range("sectors", self.sectors, 1..=10_000)?;
+        in_range("sectors", self.sectors, 2..=10_000)?;
         not_negative("map_error_m", self.map_error_m)?;
         not_negative("normal_rad", self.normal_rad)
     }

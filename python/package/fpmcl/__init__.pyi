@@ -258,7 +258,7 @@ class Estimate:
 
     @property
     def mean_cost_m(self) -> Optional[float]:
-        """Mean cost of the particles [m]; None where the scan was not used."""
+        """Mean cost at the estimate while tracking, else of the particles [m]; None where the scan was not used."""
 
     @property
     def effective_sample_size(self) -> float:

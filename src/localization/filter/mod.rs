@@ -11,7 +11,7 @@
 //! While the filter searches around one place, reweighting and resampling alternate several times within one frame,
 //! with an increasingly peaked likelihood (annealing); several places are compared as such
 //! ([`places`](super::places)). Once the distribution is narrow, `num_reduced`
-//! particles are enough; they are sampled where odometry and scan agree
+//! particles are enough; they are sampled from the product of prediction and registration
 //! ([`proposal`](super::proposal)).
 
 mod phase;

@@ -20,8 +20,8 @@ pub(super) struct Update {
     pub(super) beams: Vec<Beam>,
     /// Attitude of the sensor as estimated in this frame.
     pub(super) attitude: SensorAttitude,
-    /// Pose of the likeliest of several places.
-    pub(super) place: Option<Pose2>,
+    /// Pose of the posterior, or of the likeliest of several places; `None` for the weighted mean.
+    pub(super) pose: Option<Pose2>,
 }
 
 impl ParticleFilter {
@@ -68,7 +68,7 @@ impl ParticleFilter {
                     mean_cost_m: weighted_mean(&self.particles, &costs_m),
                     beams,
                     attitude: self.refined_attitude(scan, attitude)?,
-                    place: None,
+                    pose: None,
                 });
             }
             self.resample(rng);
@@ -94,7 +94,7 @@ impl ParticleFilter {
     }
 
     /// Multiplies the weights by a power of the likelihoods, at most `largest`. Returns the power.
-    pub(super) fn reweight(&mut self, logs: &[f64], largest: f64) -> f64 {
+    fn reweight(&mut self, logs: &[f64], largest: f64) -> f64 {
         let min_effective =
             self.config.tempering.min_effective_fraction * self.particles.len() as f64;
         let power = exponent(&self.particles.weights(), logs, min_effective, largest);
@@ -105,8 +105,8 @@ impl ParticleFilter {
 
     /// Estimate of an updated frame, which is kept for the next frames.
     pub(super) fn updated_estimate(&mut self, update: &Update) -> Result<Estimate, RenderError> {
-        let pose = update.place.unwrap_or_else(|| self.particles.mean());
-        let covariance = match update.place {
+        let pose = update.pose.unwrap_or_else(|| self.particles.mean());
+        let covariance = match update.pose {
             Some(_) => self.particles.covariance_about(&pose),
             None => self.particles.covariance_of_estimate(),
         };

@@ -94,7 +94,7 @@ impl ParticleFilter {
             mean_cost_m,
             beams,
             attitude,
-            place: Some(*places[best].pose()),
+            pose: Some(*places[best].pose()),
         }))
     }
 

@@ -42,7 +42,7 @@ pub struct ParticleFilter {
 /// Estimate of an update.
 pub(super) struct Updated {
     pub pose: Pose2,
-    /// Its covariance [m², m·rad, rad²].
+    /// Its covariance, without the error of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
     /// Whether the distribution around it was narrow.
     pub is_narrow: bool,
@@ -118,7 +118,7 @@ impl ParticleFilter {
     }
 
     /// Estimate of a frame whose scan was not used, in space on the ground below it or, without any, on
-    /// the last known ground.
+    /// the last known ground. `covariance` is without the error of the map, which is added.
     pub(super) fn estimate_of(
         &mut self,
         pose: Pose2,
