@@ -22,8 +22,8 @@ const LOCALIZATION: &str = "\
 result_path: results/localization.npz
 numParticles: 500
 plot_loc_results: False
-# The map is from exact poses.
-proposal.registration.map_error_m: 0
+# The map is from exact poses: a millimetre is the error of its surfaces.
+proposal.registration.map_error_m: 0.001
 force: True
 ";
 
