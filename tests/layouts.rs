@@ -1026,7 +1026,7 @@ fn bags_are_read_as_kiss_icp_reads_them() {
     }
     // The file in the folder is the same bag.
     let [of_folder, of_file] = ["mcap", "mcap/mcap.mcap"].map(|name| {
-        let recording = Recording::open(&folder.path().join(name)).unwrap();
+        let recording = Recording::open(folder.path().join(name)).unwrap();
         recording.frames[1].read().unwrap()
     });
     assert_eq!(of_folder, of_file);

@@ -106,7 +106,7 @@ Examples:
   fpmcl live --map map.ply --replay drive_2/  a recording at its own pace
   fpmcl live --map map.ply --replay drive_2/ --rate 2 --start last --force
   fpmcl live --map map.ply --ros2 /points     a robot with ROS 2")]
-    Live(LiveArgs),
+    Live(Box<LiveArgs>),
 
     /// Refine the trajectory that `localize` found, or a rough one from anywhere.
     #[command(after_help = "\
@@ -267,10 +267,10 @@ impl Command {
             Self::Odometry(OdometryArgs { run, .. })
             | Self::BuildMap(BuildMapArgs { run, .. })
             | Self::Localize(LocalizeArgs { run, .. })
-            | Self::Live(LiveArgs { run, .. })
             | Self::Refine(RefineArgs { run, .. })
             | Self::Evaluate(EvaluateArgs { run, .. })
             | Self::Simulate(run) => run.source.machine,
+            Self::Live(args) => args.run.source.machine,
             Self::Compare(args) => args.source.machine,
             Self::Benchmark(args) => args.machine,
             Self::Demo(args) => args.machine,
