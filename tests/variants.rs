@@ -284,8 +284,11 @@ fn refusal(message: &str) -> Outcome {
     }
 }
 
-/// Whether `info` shows the size of a mesh, and doubts its unit where that is not the metre.
+/// Whether `info` shows the size of a mesh, and doubts its unit where that is not the metre; without triangles it is a point cloud.
 fn is_described(shown: &str, mesh: &TriangleMesh, variant: &str) -> bool {
+    if mesh.triangles.is_empty() {
+        return shown.contains("a point cloud");
+    }
     let bounds = mesh.bounds();
     let ([low, high], size) = ([bounds.min.z, bounds.max.z], bounds.max - bounds.min);
     let extent = format!(
