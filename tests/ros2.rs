@@ -238,10 +238,11 @@ fn damaged_clouds_a_stall_and_a_proposed_pose_are_survived_and_reported() {
     assert!(distance_m(last, [5.5, 0.0, last[2]]) < 0.1, "{last:?}");
 }
 
-/// Frame of the robot that drives from frame 5 to frame 11 and back, after some tenths of a second.
+/// Frame of the robot that drives from frame 5 to frame 11 and back, after some tenths of a second. It stands at both ends: no robot
+/// reverses from one scan to the next.
 fn frame_to_and_fro(after: usize) -> usize {
-    let turn = after % 12;
-    5 + turn.min(12 - turn)
+    let step = after % 24;
+    5 + step.min(18_usize.saturating_sub(step)).min(6)
 }
 
 #[test]

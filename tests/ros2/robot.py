@@ -322,9 +322,9 @@ class Robot:
         """What else is sent before a scan."""
 
     def drive_until_found(self, first):
-        """Drives from frame 5 to frame 11 and back, from a tenth of a second on, until a pose of that drive is received."""
+        """Drives from frame 5 to frame 11 and back, standing at both ends, from a tenth of a second on, until a pose of that drive is received."""
         for k in range(120):
-            frame = 5 + min(k % 12, 12 - k % 12)
+            frame = 5 + max(0, min(k % 24, 18 - k % 24, 6))
             moment = first + k
             self.cloud(frame, later_ns=(moment - frame) * self.PERIOD_NS)
             time.sleep(0.1)
