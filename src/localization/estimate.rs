@@ -23,8 +23,8 @@ pub struct Estimate {
     pub covariance: Matrix3<f64>,
     /// Effective sample size after the update, before resampling (unitless).
     pub effective_sample_size: f64,
-    /// Mean cost at the estimate while tracking, else weighted mean of the particles' [m]; `None` where the scan was not used or no particle was on
-    /// the map.
+    /// Mean cost at the estimate while tracking, else weighted mean of the costs of the particles [m]; `None` where the scan
+    /// was not used or no particle was on the map.
     pub mean_cost_m: Option<f64>,
     /// Share of beams above the road that agree with the map at the estimate; `None` where unknown.
     pub agreement: Option<f64>,

@@ -86,7 +86,7 @@ impl Gaussian {
         offset.dot(&self.cholesky.solve(&offset))
     }
 
-    /// Samples poses whose mean and covariance are exactly those of the distribution; of less than four, only the mean.
+    /// Samples poses whose mean and covariance are exactly those of the distribution; of fewer than four, only the mean.
     pub fn sample(&self, count: usize, rng: &mut impl Rng) -> Vec<Pose2> {
         let draw = |_| Vector3::from_fn(|_, _| rng.sample::<f64, _>(StandardNormal));
         let mut deviates: Vec<Vector3<f64>> = (0..count).map(draw).collect();

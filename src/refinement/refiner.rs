@@ -16,9 +16,7 @@ use super::wide_search::{self, WideSearchConfig};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
 use crate::map::SensorAttitude;
-use crate::registration::{
-    RegistrationConfig, RegistrationResult, covariance_at, register_informative,
-};
+use crate::registration::{RegistrationConfig, RegistrationResult, keep, register_informative};
 use crate::rendering::RenderError;
 use crate::validation::{
     InvalidValue, Validate, in_range, nested, not_negative, positive, require,
@@ -235,17 +233,13 @@ pub fn refine_frame(
         frame.level_m = Some(patch.height_m);
     }
     if config.method != Method::None {
-        frame.covariance = match finished {
-            Some(registered) => Some(registered.planar_covariance()),
-            None => covariance_at(
-                objective.renderer,
-                objective.registered,
-                &frame.map_from_lidar,
-                &config.gauss_newton,
-            )?,
-        }
-        .unwrap_or_else(undetermined)
-            + config.gauss_newton.of_map();
+        let (renderer, beams) = (objective.renderer, objective.registered);
+        let registered = match finished {
+            Some(registered) => Some(registered),
+            None => keep(renderer, beams, &frame.map_from_lidar, &config.gauss_newton)?,
+        };
+        let covariance = registered.map(|registered| registered.planar_covariance());
+        frame.covariance = covariance.unwrap_or_else(undetermined) + config.gauss_newton.of_map();
     }
     Ok(Some(frame))
 }
@@ -555,8 +549,9 @@ mod tests {
         let frame = frame.unwrap().unwrap();
         assert_eq!(frame.pose, truth);
         let kept = &frame.map_from_lidar;
-        let expected = covariance_at(&renderer, &beams, kept, &config.gauss_newton);
-        let expected = expected.unwrap().unwrap() + config.gauss_newton.of_map();
+        let expected = keep(&renderer, &beams, kept, &config.gauss_newton);
+        let expected = expected.unwrap().unwrap().planar_covariance();
+        let expected = expected + config.gauss_newton.of_map();
         assert_eq!(frame.covariance, expected);
     }
 

@@ -80,42 +80,47 @@ pub(crate) fn register(
     /// Lever of rotations [m].
     const LEVER_M: f64 = 10.0;
     let mut pose = *initial;
-    let mut result = None;
-    for iteration in 1..=config.iterations {
+    let mut iterations = 0;
+    loop {
         let residuals = linearize(renderer, beams, &pose, config)?;
-        let Some((step, covariance)) = solve(&residuals, config) else {
+        let Some(equations) = Equations::new(&residuals, config) else {
             return Ok(None);
         };
+        let step = equations.determined_step();
         pose *= exponential(&step);
-        result = Some(RegistrationResult {
-            map_from_lidar: pose,
-            covariance,
-            iterations: iteration,
-        });
+        iterations += 1;
         let shift_m = step.fixed_rows::<3>(0).norm();
         let turn_rad = step.fixed_rows::<3>(3).norm();
-        if shift_m + LEVER_M * turn_rad < config.tolerance_m {
-            break;
+        let has_converged = shift_m + LEVER_M * turn_rad < config.tolerance_m;
+        if has_converged || iterations >= config.iterations {
+            let covariance = equations.covariance();
+            return Ok(covariance.map(|covariance| RegistrationResult {
+                map_from_lidar: pose,
+                covariance,
+                iterations,
+            }));
         }
     }
-    Ok(result)
 }
 
-/// The planar covariance of a pose that stays where it is, with the square of the step that it does not take; `None` if the
-/// beams do not determine it.
-pub(crate) fn covariance_at(
+/// A pose that stays where it is, whose covariance contains the square of the step that it does not take; `None` if the beams
+/// do not determine it.
+pub(crate) fn keep(
     renderer: &dyn RangeRenderer,
     beams: &[Beam],
     map_from_lidar: &Pose3,
     config: &RegistrationConfig,
-) -> Result<Option<Matrix3<f64>>, RenderError> {
+) -> Result<Option<RegistrationResult>, RenderError> {
     let residuals = linearize(renderer, beams, map_from_lidar, config)?;
-    let result = solve(&residuals, config).map(|(step, covariance)| RegistrationResult {
-        map_from_lidar: *map_from_lidar,
-        covariance: covariance + step * step.transpose(),
-        iterations: 0,
-    });
-    Ok(result.as_ref().map(RegistrationResult::planar_covariance))
+    let kept = |equations: Equations| {
+        let step = equations.determined_step();
+        Some(RegistrationResult {
+            map_from_lidar: *map_from_lidar,
+            covariance: equations.covariance()? + step * step.transpose(),
+            iterations: 0,
+        })
+    };
+    Ok(Equations::new(&residuals, config).and_then(kept))
 }
 
 /// Registers beams in two stages: 2,400 of them, then the 4,800 most informative ones, see [`informative::choose`]; fewer
@@ -217,70 +222,81 @@ fn residual(
     })
 }
 
-/// The Gauss-Newton step and the covariance of the pose; `None` if the information matrix is
-/// singular.
-fn solve(
-    residuals: &[Residual],
-    config: &RegistrationConfig,
-) -> Option<(Vector6<f64>, Matrix6<f64>)> {
-    /// Fewer residuals determine no pose.
-    const MIN_RESIDUALS: usize = 30;
-    if residuals.len() < MIN_RESIDUALS {
-        return None;
-    }
-    let mut information = Matrix6::zeros();
-    let mut right_side = Vector6::zeros();
-    let mut sectors = vec![(Matrix6::zeros(), Vector6::zeros()); config.sectors];
-    let (mut squares, mut weights) = (0.0, 0.0);
-    let kernel = RobustKernel {
-        scale_m: config.kernel_m,
-    };
-    for residual in residuals {
-        let jacobian = residual.jacobian;
-        let weight = kernel.weight(residual.value_m);
-        let of_residual = weight * jacobian * jacobian.transpose();
-        information += of_residual;
-        let gradient = weight * residual.value_m * jacobian;
-        right_side -= gradient;
-        let sector = &mut sectors[residual.sector];
-        sector.0 += of_residual;
-        sector.1 += gradient;
-        squares += weight * residual.value_m.powi(2);
-        weights += weight;
-    }
-    let step = information.cholesky()?.solve(&right_side);
-    let horizontal = Horizontal::new(&information, weights * config.normal_rad.powi(2))?;
-    let inverse = horizontal.corrected(&information).try_inverse()?;
-    let shifts = shifts_without_sectors(&information, &sectors, &step, &inverse)?;
-    let step = horizontal.determined(step);
-    let count = shifts.len() as f64;
-    let outer_products: Matrix6<f64> = shifts.iter().map(|it| it * it.transpose()).sum();
-    let covariance = inverse * (squares / weights) + outer_products * ((count - 1.0) / count);
-    step.iter()
-        .all(|value| value.is_finite())
-        .then_some((step, covariance))
+/// Normal equations of the residuals at a pose, with their solution.
+struct Equations {
+    information: Matrix6<f64>,
+    /// Parts of the sectors of the information and of the gradient.
+    sectors: Vec<(Matrix6<f64>, Vector6<f64>)>,
+    /// Variance of the residuals [m²].
+    variance: f64,
+    horizontal: Horizontal,
+    step: Vector6<f64>,
 }
 
-/// How far the pose after a step moves, to first order, where each sector that has residuals is left out; `sectors` are their
-/// parts of the information matrix and of the gradient before the step, `inverse` is that of the information without noise of
-/// normals. `None` if the information is singular.
-fn shifts_without_sectors(
-    information: &Matrix6<f64>,
-    sectors: &[(Matrix6<f64>, Vector6<f64>)],
-    step: &Vector6<f64>,
-    inverse: &Matrix6<f64>,
-) -> Option<Vec<Vector6<f64>>> {
-    /// Part of a sector that is left out: without all of it, what it alone determines would be unknown.
-    const PART: f64 = 0.95;
-    let shift = |(of_sector, gradient): &(Matrix6<f64>, Vector6<f64>)| {
-        let rest = (information - PART * of_sector).cholesky()?;
-        let gradient = gradient + of_sector * step;
-        Some(inverse * information * rest.solve(&gradient))
-    };
-    (sectors.iter())
-        .filter(|(of_sector, _)| of_sector.trace() > 0.0)
-        .map(shift)
-        .collect()
+impl Equations {
+    /// `None` for too few residuals, or if the information matrix is singular.
+    fn new(residuals: &[Residual], config: &RegistrationConfig) -> Option<Self> {
+        /// Fewer residuals determine no pose.
+        const MIN_RESIDUALS: usize = 30;
+        if residuals.len() < MIN_RESIDUALS {
+            return None;
+        }
+        let mut information = Matrix6::zeros();
+        let mut right_side = Vector6::zeros();
+        let mut sectors = vec![(Matrix6::zeros(), Vector6::zeros()); config.sectors];
+        let (mut squares, mut weights) = (0.0, 0.0);
+        let kernel = RobustKernel {
+            scale_m: config.kernel_m,
+        };
+        for residual in residuals {
+            let jacobian = residual.jacobian;
+            let weight = kernel.weight(residual.value_m);
+            let of_residual = weight * jacobian * jacobian.transpose();
+            information += of_residual;
+            let gradient = weight * residual.value_m * jacobian;
+            right_side -= gradient;
+            let sector = &mut sectors[residual.sector];
+            sector.0 += of_residual;
+            sector.1 += gradient;
+            squares += weight * residual.value_m.powi(2);
+            weights += weight;
+        }
+        let step = information.cholesky()?.solve(&right_side);
+        let horizontal = Horizontal::new(&information, weights * config.normal_rad.powi(2))?;
+        let is_finite = step.iter().all(|value| value.is_finite());
+        is_finite.then_some(Self {
+            information,
+            sectors,
+            variance: squares / weights,
+            horizontal,
+            step,
+        })
+    }
+
+    /// The step without directions of which only noise is known.
+    fn determined_step(&self) -> Vector6<f64> {
+        self.horizontal.determined(self.step)
+    }
+
+    /// Covariance of the pose after the step; `None` if the information is singular.
+    fn covariance(&self) -> Option<Matrix6<f64>> {
+        /// Part of a sector that is left out: without all of it, what it alone determines would be unknown.
+        const PART: f64 = 0.95;
+        let corrected = self.horizontal.corrected(&self.information);
+        let inverse = corrected.try_inverse()?;
+        let to_shift = inverse * self.information;
+        // How far the pose moves without a sector, to first order.
+        let shift = |(of_sector, gradient): &(Matrix6<f64>, Vector6<f64>)| {
+            let rest = (self.information - PART * of_sector).cholesky()?;
+            let after_step = gradient + of_sector * self.step;
+            Some(to_shift * rest.solve(&after_step))
+        };
+        let seen = (self.sectors.iter()).filter(|(of_sector, _)| of_sector.trace() > 0.0);
+        let shifts: Vec<Vector6<f64>> = seen.map(shift).collect::<Option<_>>()?;
+        let count = shifts.len() as f64;
+        let outer_products: Matrix6<f64> = shifts.iter().map(|it| it * it.transpose()).sum();
+        Some(inverse * self.variance + outer_products * ((count - 1.0) / count))
+    }
 }
 
 #[cfg(test)]
