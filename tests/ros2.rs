@@ -19,7 +19,7 @@ const RESULT: &str = "results/localization.npz";
 /// Time of the first frame of the robot in `tests/ros2/robot.py` [s].
 const FIRST_S: f64 = 1.0;
 
-/// Runs a program in a network namespace, whose interpreter is given as `$PYTHON`.
+/// Script of a shell in a network namespace: it brings up the loopback and runs its arguments.
 const IN_NAMESPACE: &str = "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo && exec \"$@\"";
 
 /// Whether a scenario that cannot run is a failure.
@@ -103,6 +103,13 @@ fn positions(messages: &Value) -> Vec<(usize, [f64; 3])> {
         .iter()
         .map(|it| (frame(it), position(it)))
         .collect()
+}
+
+/// Poses and transforms by their frames.
+fn published(received: &Value) -> Vec<(usize, [f64; 3])> {
+    let transforms = received["/tf"].as_array().unwrap().iter();
+    let poses = positions(&received["/fpmcl/pose"]).into_iter();
+    poses.chain(transforms.flat_map(positions)).collect()
 }
 
 fn distance_m(a: [f64; 3], b: [f64; 3]) -> f64 {
@@ -238,11 +245,14 @@ fn damaged_clouds_a_stall_and_a_proposed_pose_are_survived_and_reported() {
     assert!(distance_m(last, [5.5, 0.0, last[2]]) < 0.1, "{last:?}");
 }
 
-/// Frame of the robot that drives from frame 5 to frame 11 and back, after some tenths of a second. It stands at both ends: no robot
-/// reverses from one scan to the next.
-fn frame_to_and_fro(after: usize) -> usize {
-    let step = after % 24;
-    5 + step.min(18_usize.saturating_sub(step)).min(6)
+/// Position of the robot [m], at a height, that drives ahead until a moment and then from frame 5 to frame 11 and back. It stands
+/// at both ends: no robot reverses from one scan to the next.
+fn to_and_fro(moment: usize, from: usize, height_m: f64) -> [f64; 3] {
+    let frame = moment.checked_sub(from).map_or(moment, |after| {
+        let step = after % 24;
+        5 + step.min(18_usize.saturating_sub(step)).min(6)
+    });
+    [0.5 * frame as f64, 0.0, height_m]
 }
 
 #[test]
@@ -260,15 +270,8 @@ fn a_proposed_pose_that_is_wrong_is_never_published_and_the_robot_is_found_again
     let states = &received["/diagnostics"];
     assert!(states_include(received, &expected), "{states}");
     let poses = positions(&received["/fpmcl/pose"]);
-    let transforms = received["/tf"].as_array().unwrap().iter();
-    let transforms = transforms.flat_map(positions);
-    for (moment, position) in poses.iter().copied().chain(transforms) {
-        let frame = if moment < 5 {
-            moment
-        } else {
-            frame_to_and_fro(moment - 5)
-        };
-        let expected = [0.5 * frame as f64, 0.0, position[2]];
+    for (moment, position) in published(received) {
+        let expected = to_and_fro(moment, 5, position[2]);
         // The proposal is metres off. The first pose that is found has the noise of few particles.
         assert!(
             distance_m(position, expected) < 0.5,
@@ -348,16 +351,9 @@ fn a_robot_that_is_carried_elsewhere_is_lost_without_a_pose_and_found_again() {
     assert!(states_include(received, &expected), "{states}");
     // Frames 5 to 34 of the robot's clock were elsewhere: after half a second nothing is believed.
     let poses = positions(&received["/fpmcl/pose"]);
-    let transforms = received["/tf"].as_array().unwrap().iter();
-    let transforms = transforms.flat_map(positions);
-    for (moment, position) in poses.iter().copied().chain(transforms) {
+    for (moment, position) in published(received) {
         assert!(!(10..35).contains(&moment), "{moment} {position:?}");
-        let frame = if moment < 35 {
-            moment
-        } else {
-            frame_to_and_fro(moment - 35)
-        };
-        let expected = [0.5 * frame as f64, 0.0, position[2]];
+        let expected = to_and_fro(moment, 35, position[2]);
         let is_elsewhere = (5..10).contains(&moment);
         assert!(
             is_elsewhere || distance_m(position, expected) < 0.1,

@@ -19,5 +19,5 @@ mod state;
 pub use clock::{StampClock, Tick};
 pub use inbox::{Arrival, Inbox, Received};
 pub use latency::Latencies;
-pub use monitor::{LivePose, Monitor, Silence};
+pub use monitor::{LivePose, Monitor, Outage};
 pub use state::{LiveState, Reason};

@@ -14,7 +14,7 @@ use nalgebra::Matrix3;
 
 use super::state::{LiveState, Reason};
 use crate::geometry::{Pose3, pose2_from_pose3};
-use crate::localization::motion::{OdometryNoise, TurnDriveTurn};
+use crate::localization::motion::{OdometryNoise, TurnDriveTurn, jacobian_of_step};
 use crate::localization::particles::spread;
 use crate::localization::{Estimate, LocalizerConfig, State, TrackingLossConfig};
 
@@ -36,11 +36,11 @@ pub struct LivePose {
     pub covariance: Matrix3<f64>,
 }
 
-/// What a sensor sends while no scan of it is localized.
+/// Why no scan is localized.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Silence {
-    /// No scan.
-    NoScan,
+pub enum Outage {
+    /// No scan arrives.
+    NoScans,
     /// Scans that cannot be used: damaged, repeated, or of another sensor.
     UnusableScans,
 }
@@ -118,7 +118,7 @@ impl Monitor {
     /// it is measured.
     pub fn wait(
         &mut self,
-        silence: Silence,
+        outage: Outage,
         waited: Duration,
         period: Duration,
         moved: Option<&Pose3>,
@@ -131,11 +131,11 @@ impl Monitor {
                 .is_none_or(|after| spread(&after.covariance).0 > self.limits.max_spread_m),
             None => waited > LONGEST_COAST,
         };
-        self.set(match (silence, is_too_long) {
-            (Silence::NoScan, false) => Reason::SensorStalled,
-            (Silence::NoScan, true) => Reason::StalledTooLong,
-            (Silence::UnusableScans, false) => Reason::ScansUnusable,
-            (Silence::UnusableScans, true) => Reason::UnusableTooLong,
+        self.set(match (outage, is_too_long) {
+            (Outage::NoScans, false) => Reason::SensorStalled,
+            (Outage::NoScans, true) => Reason::StalledTooLong,
+            (Outage::UnusableScans, false) => Reason::ScansUnusable,
+            (Outage::UnusableScans, true) => Reason::UnusableTooLong,
         });
     }
 
@@ -168,7 +168,7 @@ impl Monitor {
         let before = pose2_from_pose3(&believed.map_from_lidar);
         let motion = pose2_from_pose3(moved);
         let step = before.rotation * motion.translation.vector;
-        let carry = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
+        let carry = jacobian_of_step(&step);
         let (sin, cos) = before.rotation.angle().sin_cos();
         let turn = Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
         let noise = self.noise.covariance(&TurnDriveTurn::decompose(&motion));

@@ -104,7 +104,7 @@ fn a_sensor_that_stalls_is_carried_by_the_motion_until_that_is_too_uncertain() {
     let after = |waited_s: f64, moved: Option<Pose3>| {
         let (mut monitor, _) = following();
         let waited = Duration::from_secs_f64(waited_s);
-        monitor.wait(Silence::NoScan, waited, PERIOD, moved.as_ref());
+        monitor.wait(Outage::NoScans, waited, PERIOD, moved.as_ref());
         monitor.reason()
     };
     // Two scans may be missing.
@@ -127,7 +127,7 @@ fn scans_that_cannot_be_used_are_as_none_with_their_own_reason() {
     let after = |waited_s: f64| {
         let (mut monitor, _) = following();
         let waited = Duration::from_secs_f64(waited_s);
-        monitor.wait(Silence::UnusableScans, waited, PERIOD, None);
+        monitor.wait(Outage::UnusableScans, waited, PERIOD, None);
         (monitor.reason(), monitor.is_carried())
     };
     assert_eq!(after(0.3), (Reason::ScanAgrees, false));
@@ -166,7 +166,7 @@ fn waiting_changes_nothing_while_no_pose_is_believed() {
     {
         let (mut monitor, _) = following();
         monitor.set(reason);
-        monitor.wait(Silence::NoScan, Duration::from_secs(9), PERIOD, None);
+        monitor.wait(Outage::NoScans, Duration::from_secs(9), PERIOD, None);
         assert_eq!(monitor.reason(), reason);
     }
 }

@@ -227,6 +227,11 @@ fn propagated_covariance(jacobian: &Matrix3x4<f64>, sigmas: &Vector4<f64>) -> Ma
     jacobian * variances * jacobian.transpose()
 }
 
+/// Jacobian of (x, y, heading) after a step [m] by the pose before it: a turn moves the end of the step aside.
+pub(crate) fn jacobian_of_step(step: &Vector2<f64>) -> Matrix3<f64> {
+    Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0)
+}
+
 /// Velocities that are held for a duration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VelocityCommand {

@@ -225,7 +225,7 @@ def receive():
     }
     while True:
         for topic, of_topic in readers.items():
-            # At its end the program takes back what it said: samples without data.
+            # At its end the program takes back what it sent: samples without data.
             for message in filter(lambda it: it.sample_info.valid_data, of_topic.take(100)):
                 print(json.dumps([topic, described(topic, message)]), flush=True)
         matched = {topic: it.get_matched_publications() for topic, it in readers.items()}
@@ -263,8 +263,11 @@ class Receiver:
                 sys.exit(f"not received in {seconds} s: {what}; states {states[-5:]}")
             time.sleep(0.01)
 
+    def has_state(self, words, after=0):
+        return any(words in it["message"] for it in self.of("/diagnostics")[after:])
+
     def wait_for_state(self, words, after=0):
-        self.wait(words, lambda: any(words in it["message"] for it in self.of("/diagnostics")[after:]))
+        self.wait(words, lambda: self.has_state(words, after))
         return len(self.of("/diagnostics"))
 
     def wait_for_program(self, before):
@@ -450,7 +453,7 @@ def frozen(folder, receiver, _program):
     for _ in range(600):
         robot.cloud(4)
         time.sleep(0.03)
-        if any(words in it["message"] for it in receiver.of("/diagnostics")):
+        if receiver.has_state(words):
             break
     receiver.wait_for_state(words)
     robot.drive(range(5, 12))
@@ -464,7 +467,7 @@ def mistyped(folder, receiver, program):
     _writer = writer(stranger, "/points", LaserScan, OF_SENSORS)
     robot = Robot(folder, receiver)
     robot.drive(range(3))
-    receiver.wait("the other type", lambda: "has arrived on /points" in program.said())
+    receiver.wait("the other type", lambda: "has arrived on /points" in program.log_text())
 
 
 def carried(folder, receiver, _program):
@@ -522,7 +525,7 @@ class Program:
     def start(self, more):
         self.process = subprocess.Popen([*self.command, *more], stdout=subprocess.PIPE, stderr=self.log, text=True)
 
-    def said(self):
+    def log_text(self):
         """Its messages so far."""
         return pathlib.Path(self.log.name).read_text()
 
@@ -543,13 +546,13 @@ def play(folder, scenario, command):
         stdout, _ = program.process.communicate(timeout=120)
     except SystemExit as failed:
         program.process.kill()
-        sys.exit(f"{failed}; the program says: {program.said()}")
+        sys.exit(f"{failed}; the program printed: {program.log_text()}")
     finally:
         program.process.kill()
         receiver.process.kill()
     if program.process.returncode not in expected:
-        sys.exit(f"the program ends with {program.process.returncode}: {program.said()}")
-    print(json.dumps({"received": receiver.messages, "report": json.loads(stdout), "stderr": program.said()}))
+        sys.exit(f"the program ends with {program.process.returncode}: {program.log_text()}")
+    print(json.dumps({"received": receiver.messages, "report": json.loads(stdout), "stderr": program.log_text()}))
 
 
 def has_loopback_alone():
@@ -563,6 +566,6 @@ if __name__ == "__main__":
     if sys.argv[1] == "receive":
         receive()
     folder, scenario = sys.argv[2:4]
-    all_of_them = [drive, events, kidnapped, misled, frozen, mistyped, carried, reliable, restarted, wheels]
-    scenarios = {it.__name__: it for it in all_of_them}
+    known = [drive, events, kidnapped, misled, frozen, mistyped, carried, reliable, restarted, wheels]
+    scenarios = {it.__name__: it for it in known}
     play(folder, scenarios[scenario], sys.argv[5:])

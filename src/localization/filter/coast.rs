@@ -4,7 +4,7 @@ use nalgebra::Matrix3;
 
 use super::state::{ParticleFilter, Pending};
 use crate::localization::estimate::Estimate;
-use crate::localization::motion::{TurnDriveTurn, VelocityCommand};
+use crate::localization::motion::{TurnDriveTurn, VelocityCommand, jacobian_of_step};
 use crate::localization::odometry::Odometry;
 use crate::map::SensorAttitude;
 use crate::rendering::RenderError;
@@ -50,7 +50,7 @@ impl ParticleFilter {
         };
         let updated = &self.updated;
         let step = updated.pose.rotation * motion.translation.vector;
-        let jacobian = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
+        let jacobian = jacobian_of_step(&step);
         let rotation = updated.pose.rotation.to_rotation_matrix().to_homogeneous();
         // With thresholds of zero every motion triggers an update, and none is ever pending.
         let share = if share.is_finite() {

@@ -20,7 +20,7 @@ use crate::app::run::Context;
 use crate::geometry::{Pose3, pose3_from_pose2};
 use crate::lidar::Motion;
 use crate::live::{
-    Arrival, Inbox, Latencies, LiveState, Monitor, Reason, Received, Silence, StampClock, Tick,
+    Arrival, Inbox, Latencies, LiveState, Monitor, Outage, Reason, Received, StampClock, Tick,
 };
 use crate::localization::{LocalizerError, Start, TrackerError};
 
@@ -314,9 +314,9 @@ impl<'a, 'b> Driver<'a, 'b> {
             let period = last.period.unwrap_or(USUAL_PERIOD).min(LONGEST_PERIOD);
             let moved = self.moved_to(time_s, (self.robot.measured)(time_s).as_ref());
             let silence = if self.rejected() > last.rejected {
-                Silence::UnusableScans
+                Outage::UnusableScans
             } else {
-                Silence::NoScan
+                Outage::NoScans
             };
             let before = self.monitor.reason();
             (self.monitor).wait(silence, waited, period, moved.as_ref());

@@ -93,7 +93,7 @@ impl Ros2Args {
         Ok(())
     }
 
-    /// Requires that the interface is one of this machine: DDS would leave out another one without a word.
+    /// Requires that the interface is one of this machine: DDS ignores any other address silently.
     pub fn check_interface(&self) -> Result<()> {
         if let Some(address) = self.interface {
             // Of the loopback only its first address is that of an interface.
@@ -140,7 +140,7 @@ impl Ros2Args {
         Ok(match self.interface {
             Some(interface) => Some(vec![interface.into()]),
             None if range == Some("LOCALHOST") || is_local_only == Some("1") => {
-                Some(vec![IpAddr::from([127, 0, 0, 1])])
+                Some(vec![Ipv4Addr::LOCALHOST.into()])
             }
             None => None,
         })
@@ -164,10 +164,9 @@ pub(super) fn topic(text: &str) -> Result<String, &'static str> {
 
 fn interface(text: &str) -> Result<Ipv4Addr, &'static str> {
     let address = text.parse::<Ipv4Addr>().ok();
-    let is_of_machine =
+    let is_unicast =
         |it: &Ipv4Addr| !(it.is_unspecified() || it.is_multicast() || it.is_broadcast());
-    (address.filter(is_of_machine))
-        .ok_or("give an IPv4 address of this machine, such as 192.168.1.5")
+    (address.filter(is_unicast)).ok_or("give an IPv4 address of this machine, such as 192.168.1.5")
 }
 
 fn node_name(text: &str) -> Result<String, &'static str> {

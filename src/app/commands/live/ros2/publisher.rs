@@ -20,6 +20,7 @@ use crate::evaluation::trust::Axes;
 use crate::geometry::{Pose3, TriangleMesh, sample_surface, surface_area_m2};
 use crate::lidar::Motion;
 use crate::live::{LivePose, LiveState, Reason};
+use crate::localization::motion::jacobian_of_step;
 
 /// Time between two diagnostics of the same state.
 const DIAGNOSTICS_PERIOD: Duration = Duration::from_secs(1);
@@ -43,7 +44,7 @@ pub struct Publisher<'a> {
     transforms: Writer,
     diagnostics: Writer,
     map: Writer,
-    /// Time after a scan for which its transform is [s].
+    /// Time after a scan for which its transform is sent [s].
     tolerance_s: f64,
     /// Name of the status in the diagnostics.
     status_name: String,
@@ -273,7 +274,7 @@ fn level(state: LiveState) -> u8 {
 fn covariance_of_child(of_lidar: &Matrix3<f64>, d: &Vector3<f64>) -> Matrix6<f64> {
     /// Rows of x, y and heading.
     const ROWS: [usize; 3] = [0, 1, 5];
-    let lever = Matrix3::new(1.0, 0.0, -d.y, 0.0, 1.0, d.x, 0.0, 0.0, 1.0);
+    let lever = jacobian_of_step(&d.xy());
     let planar = lever * of_lidar * lever.transpose();
     let mut covariance = Matrix6::from_diagonal_element(UNKNOWN_VARIANCE);
     for (i, row) in ROWS.into_iter().enumerate() {

@@ -29,8 +29,8 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const MOST_AT_ONCE: usize = 1000;
 
 /// Types of the topics that are watched.
-const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
-const ODOMETRY: &str = "nav_msgs/msg/Odometry";
+const CLOUD_TYPE: &str = "sensor_msgs/msg/PointCloud2";
+const ODOMETRY_TYPE: &str = "nav_msgs/msg/Odometry";
 
 /// The topics that are read.
 pub struct Receiver {
@@ -136,13 +136,16 @@ impl Receiver {
         };
         let odometry = odometry
             .map(|topic| {
-                let watch = Watch::new(args.remapped(topic), ODOMETRY);
-                anyhow::Ok((reader(topic, ODOMETRY, Quality::BestEffort, 100)?, watch))
+                let watch = Watch::new(args.remapped(topic), ODOMETRY_TYPE);
+                anyhow::Ok((
+                    reader(topic, ODOMETRY_TYPE, Quality::BestEffort, 100)?,
+                    watch,
+                ))
             })
             .transpose()?;
         Ok(Self {
-            cloud_watch: Watch::new(args.remapped(clouds), CLOUD),
-            clouds: reader(clouds, CLOUD, of_clouds, 5)?,
+            cloud_watch: Watch::new(args.remapped(clouds), CLOUD_TYPE),
+            clouds: reader(clouds, CLOUD_TYPE, of_clouds, 5)?,
             are_reliable: of_clouds == Quality::Reliable,
             odometry,
             transforms: reader(TRANSFORMS, TF_MESSAGE, Quality::BestEffort, 100)?,
@@ -215,7 +218,7 @@ impl Receiver {
                 }
             } else {
                 let consequence = if self.are_reliable {
-                    ", reliably: --reliability best_effort hears all senders"
+                    ": only reliable senders are received; --reliability best_effort receives from all"
                 } else {
                     ""
                 };
