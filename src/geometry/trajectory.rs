@@ -15,7 +15,7 @@ pub struct StampedPose {
     pub map_from_lidar: Pose3,
 }
 
-/// Distance driven up to each pose, starting at 0 [m]. Poses that are not a number are bridged by a straight line.
+/// Distance driven up to each pose, starting at 0 [m]. Gaps, poses that are not finite, are bridged by a straight line.
 pub fn distances_m<R, const D: usize>(poses: &[Isometry<f64, R, D>]) -> Vec<f64> {
     let mut last: Option<SVector<f64, D>> = None;
     let mut driven_m = 0.0;

@@ -167,7 +167,7 @@ impl FrameMotion {
     }
 }
 
-/// A pose per frame: where a frame has none, that of the frame before it, and before the first known one this one.
+/// A pose per frame: gaps have the last known pose, and frames before the first known pose have that one.
 fn without_gaps(poses: Vec<Option<Pose3>>) -> Vec<Pose3> {
     let mut last = poses.iter().flatten().next().copied().unwrap_or_default();
     let known = poses.into_iter().map(|pose| {

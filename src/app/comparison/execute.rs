@@ -257,9 +257,7 @@ impl Stages {
 
 /// Evaluates the final trajectory of a run, with the runtime of all stages per frame.
 fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
-    let results = LocalizationResults::read(result)?
-        .with_truth_only()
-        .into_owned();
+    let results = LocalizationResults::read(result)?.into_truth_only();
     let (poses, in_space, covariances, refinement_s) = if is_refined {
         (
             results.refined,
@@ -302,9 +300,7 @@ fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
 
 /// Trust in the states of the filter; `None` where the result lacks what it needs.
 fn trust(result: &Path) -> Result<Option<Trust>> {
-    let results = LocalizationResults::read(result)?
-        .with_truth_only()
-        .into_owned();
+    let results = LocalizationResults::read(result)?.into_truth_only();
     let columns = (results.estimates.as_deref())
         .zip(results.ground_truth.as_deref())
         .zip(results.covariances.as_deref())

@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use anyhow::bail;
 use clap::Args;
@@ -83,13 +82,8 @@ pub struct RunArgs {
 #[derive(Clone, Debug, Args, Serialize)]
 pub struct RecordingArgs {
     /// Layout of the recording, such as kitti, mulran or nuscenes; by default as its files show. Sets the key `layout`.
-    #[arg(long, value_name = "NAME", value_parser = layout)]
-    pub layout: Option<String>,
-}
-
-/// Requires the name of a layout.
-fn layout(name: &str) -> Result<String, <Layout as FromStr>::Err> {
-    name.parse::<Layout>().map(|_| name.to_owned())
+    #[arg(long, value_name = "NAME")]
+    pub layout: Option<Layout>,
 }
 
 /// Loads the configuration of a command, and notes its file. Where the argument of the command is no

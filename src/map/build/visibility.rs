@@ -206,7 +206,7 @@ impl Voter<'_> {
     fn vote(&self, range_m: f32, sine: f32, azimuth_rad: f32) -> Vote {
         /// Largest difference between a point and the end of a beam that saw it [m]. Half of a row of 0.44 degrees, 64 in 28
         /// degrees, is as much on a surface 20 m away that the beam meets at 14 degrees. It is less than the margin of a beam
-        /// that passes, so that no beam between the two votes.
+        /// that passes: a beam that ends between the two limits casts no vote.
         const SEEN_WITHIN_M: f32 = 0.3;
         if !self.model.accepts_range(range_m) {
             return Vote::Unknown;

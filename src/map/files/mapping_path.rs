@@ -115,16 +115,12 @@ impl MappingPath {
 fn lines(key: &str, json: &str) -> Vec<String> {
     /// Length of a part, if its last item ends there [bytes].
     const PART: usize = 500;
-    let mut parts = vec![key.to_owned()];
+    let mut parts: Vec<String> = Vec::new();
     for item in json.split_inclusive(',') {
-        let is_full = parts.last().is_some_and(|part| part.len() > PART);
-        if is_full {
-            parts.push(key.to_owned());
+        match parts.last_mut() {
+            Some(part) if part.len() <= PART => part.push_str(item),
+            _ => parts.push(format!("{key}{item}")),
         }
-        parts
-            .last_mut()
-            .into_iter()
-            .for_each(|part| part.push_str(item));
     }
     parts
 }

@@ -32,7 +32,7 @@ pub struct BenchmarkReport {
     /// The localization.
     pub localization: Report,
     /// Its errors after a rigid alignment of the path with the true poses, for truths of the two sessions that are not in one
-    /// frame; `null` without a second session, and without true poses of it.
+    /// frame; `null` without a second session, without its true poses, and where these determine no alignment.
     pub localization_aligned: Option<Report>,
     /// Figures that others have published, for orientation.
     pub published: Vec<Published>,

@@ -35,6 +35,7 @@ use crate::app::settings::{
     PoseInputConfig, RecordingConfig,
 };
 use crate::configuration::Configuration;
+use crate::evaluation::Alignment;
 use crate::file_path::FilePath;
 use crate::recording::Layout;
 
@@ -267,17 +268,17 @@ impl Benchmark<'_> {
     }
 
     /// Localizes a session, or every other scan of it, in a map, and refines it. The truth of another session than that of the
-    /// map may be in another frame, so that the errors are those after a rigid alignment, too.
+    /// map may be in another frame, so errors after a rigid alignment are computed as well.
     fn localization(&self, session: &Session, is_whole: bool, map: &Path) -> Result<SharedResult> {
         let mut keys = session.keys(Some(1), is_whole);
         keys.extend(session.truth_keys());
         keys.push(("map_input.map_file", path_value(&map.join(MAP))));
         let config: LocalizationConfig = self.configured(keys)?;
-        let keys = [
-            ("alignment", json!("rigid")),
-            ("output.plots", json!(false)),
-        ];
-        let evaluation: EvaluationConfig = self.configured(keys.into())?;
+        // Settings of the user do not change the alignment: the figures are named after it.
+        let evaluation = EvaluationConfig {
+            alignment: Some(Alignment::Rigid),
+            ..self.configured(vec![("output.plots", json!(false))])?
+        };
         let configs = (&config, &evaluation);
         self.stage("localization", &configs, &session.content, |folder| {
             let config = LocalizationConfig {

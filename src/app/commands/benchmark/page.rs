@@ -44,7 +44,7 @@ pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Resul
     let mut of_localization = numbers(&report.localization);
     if let Some(aligned) = &report.localization_aligned {
         of_localization.push(PageElement::Paragraph(
-            "The same after a rigid alignment of the path with the true poses: what counts where the truths of the two sessions are not in one frame."
+            "The same after a rigid alignment of the path with the true poses: these figures count where the truths of the two sessions are not in one frame."
                 .to_owned(),
         ));
         of_localization.extend(numbers(aligned));
@@ -91,7 +91,7 @@ fn published(figures: &[Published]) -> Table {
     Table {
         name: "published".to_owned(),
         title: "What others have published".to_owned(),
-        note: "Not measured here, and by the definitions of their authors. KISS-ICP raises the points of KITTI by 0.205 degrees; here they are as recorded, unless elevation_bias_deg is 0.205: its figure and ours compare only with it."
+        note: "Not measured here; by the definitions of their authors. KISS-ICP raises the points of KITTI by 0.205 degrees. Here they are as recorded unless elevation_bias_deg is 0.205; only then do its figures compare with ours."
             .to_owned(),
         columns: ["method", "data", "figure", "quantity", "source"]
             .map(Column::from)

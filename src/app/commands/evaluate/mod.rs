@@ -112,7 +112,7 @@ fn in_map(
         }
         results = truth::with_truth(results, &track, &config.result_file)?;
     }
-    let mut results = with_truth_only(&results, config)?;
+    let mut results = with_truth_only(results, config)?;
     let rules = RangeMclRules {
         convergence_interval: config.convergence_interval,
         converge_thres: config.converge_thres,
@@ -137,7 +137,7 @@ fn of_trajectory(
         track.map_from_lidar = trajectory::in_world(&track);
         results = truth::with_truth(results, &track, &config.result_file)?;
     }
-    let mut results = with_truth_only(&results, config)?;
+    let mut results = with_truth_only(results, config)?;
     let columns = (
         &mut results.estimates_in_space,
         &mut results.ground_truth_in_space,
@@ -155,23 +155,24 @@ fn of_trajectory(
 
 /// The results of the frames that have a true pose.
 fn with_truth_only(
-    results: &LocalizationResults,
+    results: LocalizationResults,
     config: &EvaluationConfig,
 ) -> Result<LocalizationResults> {
-    let known = results.with_truth_only();
+    let count = results.len();
+    let known = results.into_truth_only();
     ensure!(
         known.ground_truth.is_some() && !known.is_empty(),
         "{} has no ground truth; give the true poses of its recording by --truth FILE, and their calibration by --calib FILE (pose_file, calib_file)",
         config.result_file.display()
     );
-    if known.len() < results.len() {
+    if known.len() < count {
         tracing::warn!(
             "{} of {} frames are left out, because they have no true pose",
-            results.len() - known.len(),
-            results.len()
+            count - known.len(),
+            count
         );
     }
-    Ok(known.into_owned())
+    Ok(known)
 }
 
 /// Notes the alignment in a report.

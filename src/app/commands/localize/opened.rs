@@ -69,7 +69,7 @@ pub fn open(
         resolved.initialization() == Initialization::Tracking && resolved.initial_pose.is_none();
     ensure!(
         !is_at_truth || first.is_some_and(|frame| frame.map_from_lidar.is_some()),
-        "pose_file has no pose of the first frame, at which pose_tracking starts; give initial_pose, or start_idx of a frame with a pose"
+        "pose_file has no pose of the first frame, at which tracking starts; give initial_pose, or start_idx of a frame with a pose"
     );
     let odometry = config.tracker.odometry.clone().unwrap_or_default();
     let recording = (config.inertial).open_calibrated(recording, &odometry, context)?;

@@ -132,9 +132,8 @@ impl<T: Pod> Clone for Column<T> {
     fn clone(&self) -> Self {
         let folder = self.folder.clone();
         let is_long = size_of_val(&**self) >= Self::MOST_BYTES;
-        let in_file = is_long
-            .then(|| GrowingBytes::in_folder(folder.as_deref(), bytemuck::cast_slice(self)).ok());
-        let items = match in_file.flatten() {
+        let file = || GrowingBytes::in_folder(folder.as_deref(), bytemuck::cast_slice(self)).ok();
+        let items = match is_long.then(file).flatten() {
             Some(bytes) => Items::InFile(bytes, PhantomData),
             None => Items::InMemory(self.to_vec()),
         };
@@ -244,7 +243,7 @@ impl Row<7> for Pose3 {
     }
 }
 
-/// A pose that is not known, such as the true one of a frame without a truth: no number of its row is one.
+/// A pose that is not known, such as the true one of a frame without a truth: all its components are NaN.
 pub fn unknown_pose() -> Pose3 {
     let rotation = Quaternion::new(f64::NAN, f64::NAN, f64::NAN, f64::NAN);
     let translation = Translation3::new(f64::NAN, f64::NAN, f64::NAN);

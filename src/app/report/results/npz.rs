@@ -127,7 +127,7 @@ impl Array<'_> {
         self.finite(row, numbers)
     }
 
-    /// As [`next_finite_row`](Self::next_finite_row), of a row that may be unknown: then no number of it is one.
+    /// As [`next_finite_row`](Self::next_finite_row), but a row of NaN only, an unknown pose, is allowed, too.
     pub fn next_row_or_unknown<const N: usize>(&mut self, row: usize) -> Result<[f64; N]> {
         let numbers: [f64; N] = self.next_row()?;
         if numbers.iter().all(|number| number.is_nan()) {

@@ -75,6 +75,16 @@ impl LocalizationResults {
         is_given.then(|| (0..self.len()).map(is_known).collect())
     }
 
+    /// As [`with_truth_only`](Self::with_truth_only), without a copy where all frames have a true pose.
+    #[must_use]
+    pub fn into_truth_only(self) -> Self {
+        let known = match self.with_truth_only() {
+            Cow::Owned(known) => Some(known),
+            Cow::Borrowed(_) => None,
+        };
+        known.unwrap_or(self)
+    }
+
     /// The results of the frames that can be evaluated: those with a true pose, where a truth was given.
     pub fn with_truth_only(&self) -> Cow<'_, Self> {
         match self.has_truth() {
