@@ -4,7 +4,6 @@
 
 mod common;
 
-#[cfg(unix)]
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
@@ -156,6 +155,46 @@ fn a_truth_of_the_second_session_in_another_frame_is_compared_after_alignment() 
 }
 
 #[test]
+fn a_truth_on_a_straight_line_leaves_out_the_errors_after_alignment() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, STREET);
+    let poses = folder.join("street/drive_2/poses.txt");
+    let count = fs::read_to_string(&poses).unwrap().lines().count();
+    let row = |ahead_m: usize| format!("1 0 0 0 0 1 0 0 0 0 1 {ahead_m}\n");
+    fs::write(&poses, (0..count).map(row).collect::<String>()).unwrap();
+    let output = benchmark(folder).succeeds();
+    assert!(
+        output.stderr.contains("no errors after a rigid alignment"),
+        "{}",
+        output.stderr
+    );
+    let report = json(&folder.join("results/benchmark/benchmark.json"));
+    assert!(report["localization"]["refined"].is_object());
+    assert!(report["localization_aligned"].is_null());
+}
+
+#[test]
+fn another_error_of_the_evaluation_after_alignment_leaves_the_stage_unfinished() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, STREET);
+    // Without a truth of the first session, nothing else is evaluated with this key.
+    for name in ["poses.txt", "calib.txt"] {
+        fs::remove_file(folder.join("street/drive_1").join(name)).unwrap();
+    }
+    let call = || benchmark(folder).set("result_calib_file", "camera.txt");
+    call().fails_with(&["after a rigid alignment", "camera.txt"]);
+    let finished = finished_stages(folder);
+    assert_eq!(finished.keys().collect::<Vec<_>>(), ["map", "odometry"]);
+    // A result is not read by it, only a trajectory.
+    fs::write(folder.join("camera.txt"), "").unwrap();
+    call().succeeds();
+    let report = json(&folder.join("results/benchmark/benchmark.json"));
+    assert!(report["localization_aligned"]["refined"].is_object());
+}
+
+#[test]
 fn scans_and_truths_that_have_changed_are_measured_again() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
@@ -184,7 +223,6 @@ fn scans_and_truths_that_have_changed_are_measured_again() {
 }
 
 /// The time of each stage that a benchmark has finished, by its name.
-#[cfg(unix)]
 fn finished_stages(folder: &Path) -> BTreeMap<String, serde_json::Value> {
     let stages = fs::read_dir(folder.join("results/benchmark/stages"));
     let paths = stages.into_iter().flatten().map(|it| it.unwrap().path());

@@ -24,6 +24,7 @@ use serde_json::{Value, json};
 
 pub use self::figures::BenchmarkReport;
 use self::figures::OdometryFigures;
+use super::evaluate::NoRigidAlignment;
 use super::stages::{RecordingInputs, path_value, settings_of};
 use super::{build_map, evaluate, localize, odometry, refine};
 use crate::app::report::{Report, RunFiles};
@@ -295,9 +296,14 @@ impl Benchmark<'_> {
                     output_folder: Some(folder.join(ALIGNED).into()),
                     ..evaluation.clone()
                 };
-                // Too few trusted poses determine no alignment.
-                if let Err(error) = evaluate::run(&evaluation, self.context) {
-                    tracing::warn!("there are no errors after a rigid alignment: {error:#}");
+                match evaluate::run(&evaluation, self.context) {
+                    Ok(_report) => {}
+                    Err(error) if error.is::<NoRigidAlignment>() => tracing::warn!(
+                        "there are no errors after a rigid alignment: the trusted or the true poses are on a straight line, or too few"
+                    ),
+                    Err(error) => {
+                        return Err(error.context("while evaluating after a rigid alignment"));
+                    }
                 }
             }
             Ok(())

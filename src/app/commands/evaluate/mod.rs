@@ -10,6 +10,7 @@ use anyhow::{Result, ensure};
 use clap::Args;
 use serde::Serialize;
 
+pub use self::truth::NoRigidAlignment;
 use crate::app::report::run_output::{self, REPORT_FILES};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
 use crate::app::run::{Claims, Context, Outputs, RecordingArgs, RunArgs, input, output};

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Result, ensure};
 
 use crate::app::commands::stages::RecordingInputs;
 use crate::app::report::LocalizationResults;
@@ -15,6 +15,13 @@ use crate::recording::{Frame, PointFormat, PoseTrack, ScanSource, is_topic};
 
 /// Difference of times that are the same [s].
 const SAME_S: f64 = 1e-4;
+
+/// Positions that determine no rigid alignment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "the positions are on a straight line, which determines no rigid alignment; set alignment to first"
+)]
+pub struct NoRigidAlignment;
 
 /// Reads the configured true poses: `pose_file`, which may be a topic of the recording, else those that the recording
 /// contains. The recording of a topic is by default that of the localization.
@@ -176,7 +183,7 @@ fn poses_by_number(
 }
 
 /// Aligns the estimates and the refined trajectory with the truth, each by a transform of its own, which its trusted poses
-/// determine.
+/// determine; [`NoRigidAlignment`] if they do not.
 pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<()> {
     if alignment == Alignment::None {
         return Ok(());
@@ -211,9 +218,7 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
             (_, _, Some(estimates)) => transform(&level(estimates), &level(&truth)),
             _ => continue,
         };
-        let transform = transform.context(
-            "the positions are on a straight line, which determines no rigid alignment; set alignment to first",
-        )?;
+        let transform = transform.ok_or(NoRigidAlignment)?;
         let turn = pose2_from_pose3(&transform).rotation;
         let turn = turn.to_rotation_matrix().to_homogeneous();
         for covariance in covariances.iter_mut().flatten() {
@@ -285,5 +290,21 @@ mod tests {
                 assert_relative_eq!(found, truth, epsilon = 1e-9);
             }
         }
+    }
+
+    #[test]
+    fn a_straight_line_is_an_error_of_its_own() {
+        let line: Vec<Pose2> = (0..20)
+            .map(|k| Pose2::translation(f64::from(k), 0.0))
+            .collect();
+        let mut results = LocalizationResults {
+            frames: (0..20).collect(),
+            estimates: Some(line.clone().into()),
+            ground_truth: Some(line.into()),
+            ..LocalizationResults::default()
+        };
+        align(&mut results, Alignment::First).unwrap();
+        let error = align(&mut results, Alignment::Rigid).unwrap_err();
+        assert!(error.is::<NoRigidAlignment>(), "{error:#}");
     }
 }
