@@ -3,8 +3,8 @@
     cargo build --release
     python benches/measure.py [SUBJECT ...] [--seeds 1,2,3,4,5] [--work results/measure]
 
-Subjects: drive_0005, kitti_07, odometry, ground, demo, poisson, rays, basin, starts; all by default. A subject whose
-recording, package or program is absent is skipped with a line that names it. Recordings are below the folder in
+Subjects: drive_0005, kitti_07, odometry, benchmark, ground, demo, poisson, rays, basin, starts; all by default. A subject
+whose recording, package or program is absent is skipped with a line that names it. Recordings are below the folder in
 `FPMCL_DATA`, by default `../shared/data`; the simulated drives are made in the folder of the work, where finished
 maps are kept for the next call. The numbers of one call belong to one commit and one machine, which head the output.
 Times are those of an otherwise idle machine.
@@ -186,6 +186,64 @@ def odometry(work, _seeds):
         row(name, report["scans"], f"{report['path_m']:.0f} m", segments, f"{1e3 * median_s:.0f} ms")
 
 
+def kitti_raw_drive(work):
+    """Simulates a drive in the layout of KITTI's raw data."""
+    folder = work / "kitti_raw"
+    day = folder / "2011_09_26"
+    if not day.exists():
+        settings = [f"output_folder={folder}", "n_scans=300", "scanner.rolling_shutter=true"]
+        fpmcl("simulate", "--force", *[word for setting in settings for word in ("--set", setting)])
+        run(sys.executable, "benches/kitti_raw.py", folder / "drive_1", folder)
+    return day / "2011_09_26_drive_0001_sync"
+
+
+def benchmark_row(name, file):
+    """Prints the figures of a benchmark from its file; across sessions those after a rigid alignment."""
+    report = json.loads(file.read_text())
+    odometry = "-"
+    if report["odometry"]["scan_by_scan"]:
+        trajectory = report["odometry"]["scan_by_scan"]["trajectory"]
+        segments, lengths = trajectory["kitti_segments"], ""
+        if not segments:
+            segments, lengths = trajectory["short_segments"], " (5 to 50 m)"
+        turn = 100 * segments["rotation_deg_per_m"]
+        odometry = f"{segments['translation_percent']:.2f} %, {turn:.2f} deg per 100 m{lengths}"
+    aligned = report["localization_aligned"]
+    localization = aligned or report["localization"]
+
+    def error(run_of):
+        if not localization[run_of]:
+            return "-"
+        metrics = localization[run_of]["metrics"]
+        position_cm = 100 * metrics["position_m"]["rmse"]
+        heading_deg = math.degrees(metrics["heading_rad"]["rmse"])
+        return f"{position_cm:.2f} cm, {heading_deg:.3f} deg"
+
+    frames = localization["summary"]
+    seconds = sum(report["stage_seconds"].values())
+    tracking = f"{frames['tracking']} of {frames['frames']}"
+    name += ", aligned" if aligned else ""
+    row(name, odometry, error("mcl"), error("refined"), tracking, f"{seconds:.0f} s")
+
+
+def benchmark(work, _seeds):
+    first, second = DATA / "livox-hku1", DATA / "livox-hku2"
+    truths = ["--truth", first / "optimized_poses.txt", "--second-truth", second / "optimized_poses.txt"]
+    table("recording", "odometry", "localization", "refined", "frames tracking", "time")
+    for name, recording, arguments in [
+        ("nuScenes, one scene", DATA / "nuscenes-hdl32", []),
+        ("drive 0005", DRIVE_0005, []),
+        ("livox-hku2 in the map of livox-hku1", first, ["--second", second, *truths]),
+        ("KITTI raw, simulated", kitti_raw_drive(work), []),
+    ]:
+        if not recording.exists():
+            print(f"skipped: {recording} is absent", file=sys.stderr)
+            continue
+        output = work / "benchmark" / name.split(",")[0].replace(" ", "_")
+        fpmcl("benchmark", "auto", recording, *arguments, "--output", output)
+        benchmark_row(name, output / "benchmark.json")
+
+
 def ground(work, _seeds):
     for name in ("semantickitti-00-labels", "semantickitti-08-labels", "nuscenes-hdl32"):
         output = ["--set", f"output_folder={work / 'ground' / name}", "--set", "plot_step=0"]
@@ -223,7 +281,7 @@ def starts(work, _seeds):
     block(bench("starts", file, second, FPMCL_STARTS="40"))
 
 
-SUBJECTS = [drive_0005, kitti_07, odometry, ground, demo, poisson, rays, basin, starts]
+SUBJECTS = [drive_0005, kitti_07, odometry, benchmark, ground, demo, poisson, rays, basin, starts]
 
 
 def processor():
