@@ -13,6 +13,7 @@
 
 // State, input and output.
 pub(crate) mod config;
+mod error;
 pub(crate) mod estimate;
 pub(crate) mod odometry;
 pub(crate) mod particles;
@@ -31,13 +32,16 @@ pub(crate) mod convergence;
 pub(crate) mod tracking_loss;
 // The loop.
 pub(crate) mod filter;
+mod front_end;
 pub(crate) mod localizer;
 mod second_drive;
 pub(crate) mod tracker;
 
 pub use config::LocalizerConfig;
 pub use convergence::ConvergenceConfig;
+pub use error::TrackerError;
 pub use estimate::Estimate;
+pub use front_end::{FrontEnd, Measured};
 pub use initialization::{StartDistribution, StartSpread};
 pub use localizer::{Localizer, LocalizerError, Start};
 pub use motion::{OdometryNoise, VelocityCommand, VelocityNoise};
@@ -49,7 +53,7 @@ pub use proposal::ProposalConfig;
 pub use resampling::{KldConfig, ResamplingConfig};
 pub use second_drive::{SecondDrive, SecondDriveError};
 pub use tempering::TemperingConfig;
-pub use tracker::{Tracker, TrackerConfig, TrackerError};
+pub use tracker::{BackEnd, Tracker, TrackerConfig};
 pub use tracking_loss::{State, TrackingLossConfig};
 
 pub(crate) use preparation::ScanPreparation;

@@ -5,8 +5,9 @@ use std::sync::Arc;
 use glam::DVec3;
 use nalgebra::Point2;
 
+use super::error::TrackerError;
 use super::odometry::Odometry;
-use super::tracker::{Tracker, TrackerError};
+use super::tracker::Tracker;
 use super::tracking_loss::State;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;

@@ -1,26 +1,26 @@
 //! Tracking of a car in a map, scan by scan, whatever its sensor.
 //!
 //! ```text
-//! scan  →  sensor     given, else inferred from the first scan; own car and times of points
-//!                     once scans in motion show them
-//!       →  odometer   motion since the last scan, unless it is given
-//!       →  localizer  pose, confirmed and recovered by the particle filter
+//! scan  →  front end  sensor, times of points, motion since the last scan: nothing of the map
+//!       →  back end   pose, confirmed and recovered by the particle filter
 //! ```
-
-use std::borrow::Cow;
+//!
+//! The front end may be a scan ahead, in another thread.
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::config::LocalizerConfig;
+use super::error::TrackerError;
 use super::estimate::Estimate;
-use super::localizer::{Localizer, LocalizerError, Start};
+use super::front_end::{FrontEnd, Measured};
+use super::localizer::{Localizer, Start};
 use super::odometry::Odometry;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
 use crate::map::Map;
-use crate::odometry::{Odometer, OdometryConfig, OdometryError};
-use crate::sensor::{Sensor, SensorConfig, SensorError, TIMING_SCANS};
+use crate::odometry::OdometryConfig;
+use crate::sensor::{Sensor, SensorConfig};
 use crate::validation::{InvalidValue, Validate, nested};
 
 /// Configuration of a tracker.
@@ -50,37 +50,12 @@ impl Validate for TrackerConfig {
     }
 }
 
-/// Why a scan cannot be tracked.
-#[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages are the documentation")]
-pub enum TrackerError {
-    #[error(transparent)]
-    Invalid(#[from] InvalidValue),
-    #[error(transparent)]
-    Sensor(#[from] SensorError),
-    #[error(transparent)]
-    Odometry(#[from] OdometryError),
-    #[error(transparent)]
-    Localizer(#[from] LocalizerError),
-}
-
 /// Estimates the pose of a car in a map from its scans, one after the other. The same seed gives the same estimates.
 pub struct Tracker {
-    map: Map,
-    config: TrackerConfig,
-    start: Start,
-    /// `None` before the first scan, unless it was given.
-    sensor: Option<Sensor>,
-    /// The last scans, while an inferred sensor is not complete.
-    shown: Option<Vec<Scan>>,
-    /// `None` where it is not wanted, and since it missed a scan.
-    odometer: Option<Odometer>,
-    /// Motion since the last scan that was localized.
-    previous_from_current: Pose3,
-    /// Whether the odometer has seen the scan that is localized next.
-    is_measured: bool,
-    /// `None` before the first scan.
-    localizer: Option<Localizer>,
+    front: FrontEnd,
+    back: BackEnd,
+    /// The scan that is localized next, where it was measured.
+    measured: Option<Measured>,
 }
 
 impl Tracker {
@@ -91,32 +66,31 @@ impl Tracker {
     /// A field of the configuration is out of its range.
     pub fn new(map: &Map, config: TrackerConfig) -> Result<Self, TrackerError> {
         config.validate()?;
-        let sensor = Sensor::configured(&config.sensor);
         Ok(Self {
-            map: map.clone(),
-            start: Start::unknown(map),
-            shown: sensor.is_none().then(Vec::new),
-            sensor,
-            odometer: config.odometry.clone().map(Odometer::new).transpose()?,
-            previous_from_current: Pose3::identity(),
-            is_measured: false,
-            localizer: None,
-            config,
+            front: FrontEnd::new(config.sensor, config.odometry)?,
+            back: BackEnd {
+                map: map.clone(),
+                config: config.localizer,
+                seed: config.seed,
+                start: Start::unknown(map),
+                since_localized: Pose3::identity(),
+                localizer: None,
+            },
+            measured: None,
         })
     }
 
     /// The same tracker before its first scan, with a known start.
     #[must_use]
     pub fn with_start(mut self, start: Start) -> Self {
-        self.start = start;
+        self.back.start = start;
         self
     }
 
     /// The same tracker before its first scan, with a known sensor, in which the configured values take precedence.
     #[must_use]
     pub fn with_sensor(mut self, sensor: Sensor) -> Self {
-        self.sensor = Some(sensor.with_known(&self.config.sensor));
-        self.shown = None;
+        self.front.set_sensor(sensor);
         self
     }
 
@@ -125,13 +99,9 @@ impl Tracker {
     /// # Errors
     /// As [`new`](Self::new).
     pub fn restart(&mut self, start: Start) -> Result<(), TrackerError> {
-        self.start = start;
-        self.odometer = (self.config.odometry.clone())
-            .map(Odometer::new)
-            .transpose()?;
-        self.previous_from_current = Pose3::identity();
-        self.is_measured = false;
-        self.localizer = None;
+        self.front.restart()?;
+        self.back.restart(start);
+        self.measured = None;
         Ok(())
     }
 
@@ -141,23 +111,24 @@ impl Tracker {
     /// # Errors
     /// As [`step`](Self::step).
     pub fn prepare_start(&mut self, scan: &Scan) -> Result<(), TrackerError> {
-        let sensor = match &self.sensor {
-            Some(sensor) => sensor.clone(),
-            None => Sensor::infer(std::slice::from_ref(scan), &self.config.sensor)?,
-        };
-        let (config, start) = (self.config.localizer.clone(), self.start.clone());
-        let mut localizer = Localizer::new(&self.map, &sensor, config, start, self.config.seed)?;
+        let sensor = self.front.sensor_in(scan)?;
+        let mut localizer = self.back.begin(&sensor)?;
         Ok(localizer.prepare_start(&sensor.timed(scan))?)
     }
 
     /// The map.
     pub fn map(&self) -> &Map {
-        &self.map
+        &self.back.map
     }
 
     /// The sensor, as far as it is known; `None` before the first scan, unless it was given.
     pub fn sensor(&self) -> Option<&Sensor> {
-        self.sensor.as_ref()
+        self.front.sensor()
+    }
+
+    /// The two halves, so that one scan is localized while the next one is measured.
+    pub fn split(&mut self) -> (&mut FrontEnd, &mut BackEnd) {
+        (&mut self.front, &mut self.back)
     }
 
     /// Estimates `map_from_lidar` at the moment of the next scan; the motion is that of the scans.
@@ -170,29 +141,19 @@ impl Tracker {
         self.step_with_motion(scan, odometry)
     }
 
-    /// Takes a scan between those that are localized, which only the odometry needs.
-    pub(crate) fn pass(&mut self, scan: &Scan) -> Result<(), TrackerError> {
-        let scan = self.prepare(scan)?;
-        if let Some(odometer) = &mut self.odometer {
-            self.previous_from_current *= odometer.step(&scan)?.previous_from_current;
-        }
-        Ok(())
-    }
-
     /// Measures the motion into the next scan since the last one that was localized; it is localized by
     /// [`step_with_motion`](Self::step_with_motion) afterwards. `Unknown` without odometry.
     ///
     /// # Errors
     /// The first scan has no points, from which the sensor is inferred, or times of scans do not ascend.
     pub fn measure(&mut self, scan: &Scan) -> Result<Odometry, TrackerError> {
-        self.pass(scan)?;
-        self.is_measured = true;
-        let is_known = self.odometer.is_some();
-        Ok(if is_known {
-            Odometry::Motion(self.previous_from_current)
-        } else {
-            Odometry::Unknown
-        })
+        if let Some(before) = self.measured.take() {
+            self.back.leave_out(&before);
+        }
+        let measured = self.front.measure(scan)?;
+        let odometry = self.back.motion_into(&measured);
+        self.measured = Some(measured);
+        Ok(odometry)
     }
 
     /// Estimates `map_from_lidar` at the moment of the next scan, given the motion since the last one that was localized. The odometry of the
@@ -205,61 +166,74 @@ impl Tracker {
         scan: &Scan,
         odometry: Odometry,
     ) -> Result<Estimate, TrackerError> {
-        let scan = if self.is_measured {
-            self.timed(scan)
-        } else {
-            self.odometer = None;
-            self.prepare(scan)?
+        let measured = match self.measured.take() {
+            Some(measured) => measured,
+            None => self.front.unmeasured(scan)?,
         };
-        self.is_measured = false;
-        let localizer = match self.localizer.take() {
+        self.back.step(scan, &measured, odometry)
+    }
+}
+
+/// The half of a [`Tracker`] that needs the map.
+pub struct BackEnd {
+    map: Map,
+    config: LocalizerConfig,
+    seed: u64,
+    start: Start,
+    /// Motion since the last scan that was localized, over those that could not be.
+    since_localized: Pose3,
+    /// `None` before the first scan.
+    localizer: Option<Localizer>,
+}
+
+impl BackEnd {
+    /// The motion into a scan since the last one that was localized, as the scans show it.
+    pub fn motion_into(&self, measured: &Measured) -> Odometry {
+        (measured.previous_from_current).map_or(Odometry::Unknown, |motion| {
+            Odometry::Motion(self.since_localized * motion)
+        })
+    }
+
+    /// Estimates `map_from_lidar` at the moment of the next scan, given the motion since the last one that was localized.
+    ///
+    /// # Errors
+    /// The motion is impossible, the points do not fit the sensor, the start is outside of the map, or the map cannot be
+    /// rendered.
+    pub fn step(
+        &mut self,
+        scan: &Scan,
+        measured: &Measured,
+        odometry: Odometry,
+    ) -> Result<Estimate, TrackerError> {
+        let mut localizer = match self.localizer.take() {
             Some(localizer) => localizer,
-            None => self.begin()?,
+            None => self.begin(&measured.sensor)?,
         };
-        let localizer = self.localizer.insert(localizer);
-        let estimate = localizer.step(&scan, odometry)?;
-        // After an error the motion is still that since the last scan that was localized.
-        self.previous_from_current = Pose3::identity();
-        Ok(estimate)
+        localizer.set_own_car(measured.sensor.own_car_m);
+        let scan = measured.timed.as_ref().unwrap_or(scan);
+        let estimate = self.localizer.insert(localizer).step(scan, odometry);
+        match estimate {
+            Ok(_) => self.since_localized = Pose3::identity(),
+            Err(_) => self.leave_out(measured),
+        }
+        Ok(estimate?)
+    }
+
+    /// Remembers the motion into a scan that is not localized.
+    fn leave_out(&mut self, measured: &Measured) {
+        self.since_localized *= measured.previous_from_current.unwrap_or_default();
+    }
+
+    fn restart(&mut self, start: Start) {
+        self.start = start;
+        self.since_localized = Pose3::identity();
+        self.localizer = None;
     }
 
     /// The localizer before the first scan.
-    fn begin(&self) -> Result<Localizer, TrackerError> {
-        let sensor = self.sensor.as_ref().ok_or(SensorError::NoPoints)?;
-        let (config, start) = (self.config.localizer.clone(), self.start.clone());
-        let localizer = Localizer::new(&self.map, sensor, config, start, self.config.seed);
-        Ok(localizer?)
-    }
-
-    /// Learns about the sensor from a scan; returns it with the times of its points.
-    fn prepare<'a>(&mut self, scan: &'a Scan) -> Result<Cow<'a, Scan>, TrackerError> {
-        let known = &self.config.sensor;
-        let sensor = match self.sensor.take() {
-            Some(sensor) => sensor,
-            None => Sensor::infer(std::slice::from_ref(scan), known)?,
-        };
-        let sensor = self.sensor.insert(sensor);
-        if let Some(shown) = &mut self.shown {
-            shown.push(scan.clone());
-            if shown.len() == TIMING_SCANS {
-                // What cannot be learned from these scans may be learned from the next ones.
-                let shown = std::mem::take(shown);
-                if sensor.complete(&shown, known)? {
-                    self.shown = None;
-                }
-                if let Some(localizer) = &mut self.localizer {
-                    localizer.set_own_car(sensor.own_car_m);
-                }
-            }
-        }
-        Ok(self.timed(scan))
-    }
-
-    fn timed<'a>(&self, scan: &'a Scan) -> Cow<'a, Scan> {
-        match &self.sensor {
-            Some(sensor) => sensor.timed(scan),
-            None => Cow::Borrowed(scan),
-        }
+    fn begin(&self, sensor: &Sensor) -> Result<Localizer, TrackerError> {
+        let (config, start) = (self.config.clone(), self.start.clone());
+        Ok(Localizer::new(&self.map, sensor, config, start, self.seed)?)
     }
 }
 

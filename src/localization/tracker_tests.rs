@@ -4,6 +4,8 @@ use super::*;
 use crate::geometry::Pose2;
 use crate::localization::{StartSpread, State};
 use crate::map::world_for_tests::TestWorld;
+use crate::odometry::Odometer;
+use crate::sensor::SensorError;
 
 fn config() -> TrackerConfig {
     TrackerConfig {
@@ -67,13 +69,65 @@ fn a_tracker_is_the_odometer_and_the_localizer() {
     for (row, (_, scan)) in drive.iter().enumerate() {
         motion *= odometer.step(scan).unwrap().previous_from_current;
         if row % 2 == 1 {
-            tracker.pass(scan).unwrap();
+            tracker.split().0.pass(scan).unwrap();
             continue;
         }
         let expected = localizer.step(scan, Odometry::Motion(motion)).unwrap();
         let found = tracker.step(scan).unwrap();
         assert_eq!(found.particles, expected.particles, "scan {row}");
         motion = Pose3::identity();
+    }
+}
+
+#[test]
+fn the_front_end_may_be_a_scan_ahead() {
+    let world = TestWorld::street();
+    let drive = drive(&world);
+    // The sensor is complete after some scans, which changes what the localizer leaves out.
+    let tracker = || {
+        let tracker = Tracker::new(&world.map(), config()).unwrap();
+        tracker.with_start(near(&drive[0].0))
+    };
+    let (mut in_turn, mut ahead) = (tracker(), tracker());
+    let (front, back) = ahead.split();
+    let mut next = Some(front.measure(&drive[0].1).unwrap());
+    for (row, (_, scan)) in drive.iter().enumerate() {
+        let measured = next.take().unwrap();
+        let odometry = back.motion_into(&measured);
+        let (estimate, following) = rayon::join(
+            || back.step(scan, &measured, odometry).unwrap(),
+            || Some(front.measure(&drive.get(row + 1)?.1).unwrap()),
+        );
+        next = following;
+        let expected = in_turn.step(scan).unwrap();
+        assert_eq!(estimate.particles, expected.particles, "scan {row}");
+    }
+}
+
+#[test]
+fn a_scan_that_cannot_be_localized_does_not_lose_its_motion() {
+    let world = TestWorld::street();
+    let drive = drive(&world);
+    let tracker = || {
+        let tracker = Tracker::new(&world.map(), config()).unwrap();
+        tracker.with_start(near(&drive[0].0))
+    };
+    let (mut found, mut expected) = (tracker(), tracker());
+    for (row, (_, scan)) in drive.iter().enumerate() {
+        let impossible = Odometry::Increment(Pose2::translation(f64::NAN, 0.0));
+        let of_scan = found.measure(scan).unwrap();
+        if row == 5 {
+            found.step_with_motion(scan, impossible).unwrap_err();
+            expected.split().0.pass(scan).unwrap();
+            continue;
+        }
+        let found = found.step_with_motion(scan, of_scan).unwrap();
+        let expected = expected.step(scan).unwrap();
+        let apart = expected.pose.inverse() * found.pose;
+        assert!(
+            apart.translation.vector.norm() < 0.02,
+            "scan {row}: {apart}"
+        );
     }
 }
 

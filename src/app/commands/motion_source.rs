@@ -121,13 +121,21 @@ impl MotionSource {
         }
     }
 
-    /// Takes the frames before one that only the odometry of the scans needs, in order.
-    pub fn frames_before(&mut self, frame: &Frame) -> Vec<Frame> {
-        let Self::Scans(skipped) = self else {
-            return vec![];
-        };
-        let count = skipped.partition_point(|between| between.number < frame.number);
-        skipped.drain(..count).collect()
+    /// Takes the frames between the selected ones, which only the odometry of the scans needs.
+    pub fn take_frames_between(&mut self) -> VecDeque<Frame> {
+        match self {
+            Self::Scans(between) => std::mem::take(between),
+            Self::Given(_) | Self::Unknown => VecDeque::new(),
+        }
+    }
+
+    /// Takes those before a selected frame, in order.
+    pub fn frames_before<'a>(
+        between: &'a mut VecDeque<Frame>,
+        frame: &Frame,
+    ) -> impl Iterator<Item = Frame> + 'a {
+        let count = between.partition_point(|it| it.number < frame.number);
+        between.drain(..count)
     }
 }
 

@@ -400,6 +400,7 @@ fn increments(
         sequence,
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
+    let mut between = motion.take_frames_between();
     let mut odometer = Odometer::new(OdometryConfig::default())?;
     let into_frame = |(row, frame): (usize, &Frame)| {
         if !matches!(motion, MotionSource::Scans(_)) {
@@ -408,9 +409,10 @@ fn increments(
                 .map(|motion| motion.increment));
         }
         let mut increment = Pose3::identity();
-        for scan in motion.frames_before(frame).iter().chain([frame]) {
+        for scan in MotionSource::frames_before(&mut between, frame) {
             increment *= odometer.step(&scan.read()?)?.previous_from_current;
         }
+        increment *= odometer.step(&frame.read()?)?.previous_from_current;
         Ok(Some(pose2_from_pose3(&increment)))
     };
     sequence.frames.iter().enumerate().map(into_frame).collect()

@@ -50,7 +50,7 @@ impl Drive<'_, '_> {
     /// inbox until it is closed, closes it at the end, and counts what it could not read.
     pub fn run(
         &self,
-        motion: &mut MotionSource,
+        motion: MotionSource,
         start: Start,
         sinks: Sinks,
         robot: Robot<'_>,

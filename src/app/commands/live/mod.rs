@@ -186,7 +186,7 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
     let sinks = sinks(args)?;
     let open = if topic.is_some() { open_driving } else { open };
     let opened = open(config, &[last_pose::FILE], context);
-    let localize = |opened: &Opened, motion: &mut MotionSource, recorded: Recorded<'_, '_>| {
+    let localize = |opened: &Opened, motion: MotionSource, recorded: Recorded<'_, '_>| {
         let start = last.as_ref().map_or_else(
             || start(config, &opened.map, &opened.recording),
             |last| Start::near(last, config.start.clone()),

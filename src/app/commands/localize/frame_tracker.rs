@@ -1,5 +1,6 @@
 //! One step of a localization: a frame with the motion into it.
 
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
@@ -9,7 +10,9 @@ use super::opened::Opened;
 use crate::app::settings::MotionModel;
 use crate::lidar::Scan;
 use crate::localization::motion::VelocityCommand;
-use crate::localization::{Estimate, Odometry, Start, Tracker, TrackerConfig, TrackerError};
+use crate::localization::{
+    BackEnd, Estimate, FrontEnd, Measured, Odometry, Start, Tracker, TrackerConfig, TrackerError,
+};
 use crate::recording::Frame;
 use crate::refinement::{FrameResult, InitialEstimate, TrajectoryRefiner};
 
@@ -21,15 +24,34 @@ pub struct TrackedFrame<'a> {
     pub estimate: Estimate,
     /// The refined estimate, where every frame is refined.
     pub refined: Option<&'a FrameResult>,
-    /// Computing times of the filter and of the refinement.
+    /// Times: of the frame without its refinement, and of that. Where the next frame is measured meanwhile, the former is the time
+    /// since the frame before was done.
     pub runtimes: [Duration; 2],
+}
+
+/// A frame whose scan was read, with the motion into it as the scans show it.
+pub struct MeasuredFrame<'a> {
+    /// The frame.
+    pub frame: &'a Frame,
+    /// Its scan.
+    pub scan: Scan,
+    measured: Measured,
 }
 
 /// Localizes frames one after the other; frames may be left out.
 pub struct FrameTracker<'a> {
-    opened: &'a Opened,
-    motion: &'a mut MotionSource,
     tracker: Tracker,
+    /// Frames between those that are localized, of which the odometry of the scans needs all.
+    between: VecDeque<Frame>,
+    rest: Rest<'a>,
+    /// When the last frame was done, before the first when it was begun.
+    done: Instant,
+}
+
+/// What is done with a frame that was measured.
+struct Rest<'a> {
+    opened: &'a Opened,
+    motion: MotionSource,
     refiner: Option<TrajectoryRefiner>,
     /// Row of the last frame in the recording, and its time [s].
     last: Option<(usize, f64)>,
@@ -37,7 +59,7 @@ pub struct FrameTracker<'a> {
 
 impl<'a> FrameTracker<'a> {
     /// A tracker before the first frame.
-    pub fn new(opened: &'a Opened, motion: &'a mut MotionSource, start: Start) -> Result<Self> {
+    pub fn new(opened: &'a Opened, mut motion: MotionSource, start: Start) -> Result<Self> {
         let Opened {
             config,
             map,
@@ -57,11 +79,15 @@ impl<'a> FrameTracker<'a> {
         let seed = config.tracker.seed;
         let refiner = sensor.map(|it| TrajectoryRefiner::new(map, it, config.refiner(), seed));
         Ok(Self {
-            opened,
-            motion,
             tracker: tracker.with_start(start),
-            refiner: refiner.transpose()?,
-            last: None,
+            between: motion.take_frames_between(),
+            rest: Rest {
+                opened,
+                motion,
+                refiner: refiner.transpose()?,
+                last: None,
+            },
+            done: Instant::now(),
         })
     }
 
@@ -75,33 +101,105 @@ impl<'a> FrameTracker<'a> {
         self.tracker.restart(start)
     }
 
-    /// Localizes a frame, later than those before; `measured` is the motion since the last one that was localized, where the
+    /// Localizes a frame, later than those before; `given` is the motion since the last one that was localized, where the
     /// robot measures it.
     pub fn step(
         &mut self,
         frame: &Frame,
         scan: &Scan,
-        measured: Option<FrameMotion>,
+        given: Option<FrameMotion>,
+    ) -> Result<TrackedFrame<'_>> {
+        let started = Instant::now();
+        let (front, back) = self.tracker.split();
+        let measured = measure(front, &mut self.between, frame, scan)?;
+        let mut tracked = self.rest.step(back, frame, scan, &measured, given)?;
+        tracked.runtimes[0] = started.elapsed() - tracked.runtimes[1];
+        Ok(tracked)
+    }
+
+    /// Reads the first frame and measures it.
+    pub fn begin<'f>(&mut self, frame: &'f Frame) -> Result<MeasuredFrame<'f>> {
+        self.done = Instant::now();
+        read(self.tracker.split().0, &mut self.between, frame)
+    }
+
+    /// Localizes a frame and records it, while the next one is read and measured.
+    pub fn step_ahead<'f>(
+        &mut self,
+        current: &MeasuredFrame,
+        next: Option<&'f Frame>,
+        record: impl FnOnce(&TrackedFrame) -> Result<()> + Send,
+    ) -> (Result<()>, Option<Result<MeasuredFrame<'f>>>) {
+        let MeasuredFrame {
+            frame,
+            scan,
+            measured,
+        } = current;
+        let (front, back) = self.tracker.split();
+        let (rest, done) = (&mut self.rest, &mut self.done);
+        let localize = || {
+            let mut tracked = rest.step(back, frame, scan, measured, None)?;
+            let since = std::mem::replace(done, Instant::now());
+            tracked.runtimes[0] = done.duration_since(since) - tracked.runtimes[1];
+            record(&tracked)
+        };
+        let read = || next.map(|next| read(front, &mut self.between, next));
+        rayon::join(localize, read)
+    }
+}
+
+/// Reads a frame and measures the motion into it.
+fn read<'f>(
+    front: &mut FrontEnd,
+    between: &mut VecDeque<Frame>,
+    frame: &'f Frame,
+) -> Result<MeasuredFrame<'f>> {
+    let scan = frame.read()?;
+    Ok(MeasuredFrame {
+        frame,
+        measured: measure(front, between, frame, &scan)?,
+        scan,
+    })
+}
+
+/// Measures the motion into a frame, over those between.
+fn measure(
+    front: &mut FrontEnd,
+    between: &mut VecDeque<Frame>,
+    frame: &Frame,
+    scan: &Scan,
+) -> Result<Measured> {
+    for between in MotionSource::frames_before(between, frame) {
+        front.pass(&between.read()?)?;
+    }
+    Ok(front.measure(scan)?)
+}
+
+impl Rest<'_> {
+    /// Localizes a frame and refines it, where every frame is refined.
+    fn step(
+        &mut self,
+        back: &mut BackEnd,
+        frame: &Frame,
+        scan: &Scan,
+        measured: &Measured,
+        given: Option<FrameMotion>,
     ) -> Result<TrackedFrame<'_>> {
         let frames = &self.opened.recording.frames;
         let started = Instant::now();
-        for between in self.motion.frames_before(frame) {
-            self.tracker.pass(&between.read()?)?;
-        }
         let row = frames.partition_point(|it| it.number < frame.number);
         let (since, before_s) = match self.last {
             Some((last, time_s)) => (last + 1, time_s),
             None => (row, frame.time_s),
         };
-        let of_scans = self.tracker.measure(scan)?;
-        let motion = match (measured, of_scans) {
-            (Some(measured), _) => Some(measured),
+        let motion = match (given, back.motion_into(measured)) {
+            (Some(given), _) => Some(given),
             (None, Odometry::Motion(motion)) => Some(FrameMotion::from_motion(motion)),
             _ => self.motion.given_over(since..row + 1),
         };
         let times_s = [before_s, frame.time_s];
         let odometry = odometry_into(self.opened.config.motion_model, motion, times_s);
-        let estimate = self.tracker.step_with_motion(scan, odometry)?;
+        let estimate = back.step(scan, measured, odometry)?;
         self.last = Some((row, frame.time_s));
         let runtime = started.elapsed();
         let refined = match &mut self.refiner {

@@ -107,19 +107,19 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
 }
 
 /// Access to the localized frames.
-pub type Recorded<'a, 'b> = &'a dyn Fn() -> MutexGuard<'b, Run>;
+pub type Recorded<'a, 'b> = &'a (dyn Fn() -> MutexGuard<'b, Run> + Sync);
 
 /// Has frames localized and recorded, and writes the result.
 pub fn run_with(
-    (opened, mut motion, claims): (Opened, MotionSource, Claims),
+    (opened, motion, claims): (Opened, MotionSource, Claims),
     context: &Context,
-    localize: impl FnOnce(&Opened, &mut MotionSource, Recorded<'_, '_>) -> Result<()>,
+    localize: impl FnOnce(&Opened, MotionSource, Recorded<'_, '_>) -> Result<()>,
 ) -> Result<Report> {
     let run = Mutex::new(Run::new(&opened, claims)?);
     let recorded = || run.lock().unwrap_or_else(PoisonError::into_inner);
     context.interrupt.supervise(
         || {
-            localize(&opened, &mut motion, &recorded)?;
+            localize(&opened, motion, &recorded)?;
             let searched = if context.interrupt.requested() {
                 None
             } else {

@@ -6,7 +6,7 @@ use anyhow::Result;
 use nalgebra::Vector2;
 
 use super::super::motion_source::MotionSource;
-use super::frame_tracker::FrameTracker;
+use super::frame_tracker::{FrameTracker, TrackedFrame};
 use super::opened::Opened;
 use super::recorder::Run;
 use crate::app::run::Context;
@@ -19,27 +19,34 @@ use crate::recording::Recording;
 /// Localizes frames until the end, an interruption or an error, which is recorded.
 pub fn localize<'a>(
     opened: &Opened,
-    motion: &mut MotionSource,
-    recorded: &dyn Fn() -> MutexGuard<'a, Run>,
+    motion: MotionSource,
+    recorded: &(dyn Fn() -> MutexGuard<'a, Run> + Sync),
     context: &Context,
 ) -> Result<()> {
-    let frames = &opened.recording.frames;
     let start = start(&opened.config, &opened.map, &opened.recording);
     let mut tracker = FrameTracker::new(opened, motion, start)?;
-    let task = context.progress.task("localize", frames.len());
-    for frame in frames {
+    let task = (context.progress).task("localize", opened.recording.frames.len());
+    let mut frames = opened.recording.frames.iter();
+    let mut next = frames.next().map(|first| tracker.begin(first));
+    while let Some(current) = next {
         if context.interrupt.requested() {
             break;
         }
-        let mut process = || {
-            let scan = frame.read()?;
-            let tracked = tracker.step(frame, &scan, None)?;
-            recorded().record(frame, &scan, &tracked)
+        let process = || {
+            let current = current?;
+            let record = |tracked: &TrackedFrame<'_>| {
+                recorded().record(current.frame, &current.scan, tracked)
+            };
+            let (recorded, next) = tracker.step_ahead(&current, frames.next(), record);
+            recorded.map(|()| next)
         };
-        if let Err(error) = process() {
-            recorded().failure = Some(error);
-            break;
-        }
+        next = match process() {
+            Ok(next) => next,
+            Err(error) => {
+                recorded().failure = Some(error);
+                break;
+            }
+        };
         task.advance(1);
     }
     Ok(())

@@ -79,7 +79,7 @@ pub fn drive(
     args: &Ros2Args,
     clouds: &str,
     drive: &Drive,
-    motion: &mut MotionSource,
+    motion: MotionSource,
     start: Start,
     sinks: Sinks,
 ) -> Result<()> {

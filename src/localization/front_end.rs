@@ -1,0 +1,139 @@
+//! What precedes the localization of a scan and needs no map: the sensor, the times of its points, and the motion to it.
+
+use std::borrow::Cow;
+use std::sync::Arc;
+
+use super::error::TrackerError;
+use crate::geometry::Pose3;
+use crate::lidar::Scan;
+use crate::odometry::{Odometer, OdometryConfig};
+use crate::sensor::{Sensor, SensorConfig, SensorError, TIMING_SCANS};
+use crate::validation::InvalidValue;
+
+/// The half of a [`Tracker`](super::Tracker) that needs no map. The sensor is given, else inferred from the first scan, and its own car and
+/// the times of points once scans in motion show them.
+pub struct FrontEnd {
+    known: SensorConfig,
+    /// `None` before the first scan, unless it was given.
+    sensor: Option<Arc<Sensor>>,
+    /// The last scans, while an inferred sensor is not complete.
+    shown: Option<Vec<Scan>>,
+    odometry: Option<OdometryConfig>,
+    /// `None` where it is not wanted, and since it missed a scan.
+    odometer: Option<Odometer>,
+    /// Motion over the scans since the last one that was measured.
+    since_measured: Pose3,
+}
+
+/// What is known about a scan before it is localized.
+#[derive(Clone, Debug)]
+pub struct Measured {
+    pub(super) sensor: Arc<Sensor>,
+    /// The scan with the times of its points, where it lacked them.
+    pub(super) timed: Option<Scan>,
+    /// Motion since the last scan that was measured; `None` without odometry.
+    pub(super) previous_from_current: Option<Pose3>,
+}
+
+impl FrontEnd {
+    pub(super) fn new(
+        known: SensorConfig,
+        odometry: Option<OdometryConfig>,
+    ) -> Result<Self, InvalidValue> {
+        let sensor = Sensor::configured(&known).map(Arc::new);
+        Ok(Self {
+            shown: sensor.is_none().then(Vec::new),
+            sensor,
+            odometer: odometry.clone().map(Odometer::new).transpose()?,
+            odometry,
+            since_measured: Pose3::identity(),
+            known,
+        })
+    }
+
+    pub(super) fn set_sensor(&mut self, sensor: Sensor) {
+        self.sensor = Some(Arc::new(sensor.with_known(&self.known)));
+        self.shown = None;
+    }
+
+    /// Forgets all scans but what they showed about the sensor.
+    pub(super) fn restart(&mut self) -> Result<(), InvalidValue> {
+        self.odometer = self.odometry.clone().map(Odometer::new).transpose()?;
+        self.since_measured = Pose3::identity();
+        Ok(())
+    }
+
+    pub(super) fn sensor(&self) -> Option<&Sensor> {
+        self.sensor.as_deref()
+    }
+
+    /// The sensor, as far as it is known, else as a scan shows it.
+    pub(super) fn sensor_in(&self, scan: &Scan) -> Result<Arc<Sensor>, SensorError> {
+        if let Some(sensor) = &self.sensor {
+            return Ok(sensor.clone());
+        }
+        let sensor = Sensor::infer(std::slice::from_ref(scan), &self.known)?;
+        Ok(Arc::new(sensor))
+    }
+
+    /// Takes a scan between those that are localized, which only the odometry needs.
+    ///
+    /// # Errors
+    /// As [`measure`](Self::measure).
+    pub fn pass(&mut self, scan: &Scan) -> Result<(), TrackerError> {
+        self.advance(scan)?;
+        Ok(())
+    }
+
+    /// Measures the motion into the next scan that is localized.
+    ///
+    /// # Errors
+    /// The first scan has no points, from which the sensor is inferred, or times of scans do not ascend.
+    pub fn measure(&mut self, scan: &Scan) -> Result<Measured, TrackerError> {
+        let measured = self.advance(scan)?;
+        let motion = std::mem::take(&mut self.since_measured);
+        Ok(Measured {
+            previous_from_current: self.odometer.is_some().then_some(motion),
+            ..measured
+        })
+    }
+
+    /// Prepares a scan whose motion is given: the odometry of the scans ends with it.
+    pub(super) fn unmeasured(&mut self, scan: &Scan) -> Result<Measured, TrackerError> {
+        self.odometer = None;
+        self.measure(scan)
+    }
+
+    fn advance(&mut self, scan: &Scan) -> Result<Measured, TrackerError> {
+        let sensor = self.learn(scan)?;
+        let timed = sensor.timed(scan);
+        if let Some(odometer) = &mut self.odometer {
+            self.since_measured *= odometer.step(&timed)?.previous_from_current;
+        }
+        let timed = match timed {
+            Cow::Borrowed(_) => None,
+            Cow::Owned(timed) => Some(timed),
+        };
+        Ok(Measured {
+            sensor,
+            timed,
+            previous_from_current: None,
+        })
+    }
+
+    /// The sensor, about which a scan may show more.
+    fn learn(&mut self, scan: &Scan) -> Result<Arc<Sensor>, SensorError> {
+        let mut sensor = self.sensor_in(scan)?;
+        if let Some(shown) = &mut self.shown {
+            shown.push(scan.clone());
+            if shown.len() == TIMING_SCANS {
+                // What cannot be learned from these scans may be learned from the next ones.
+                let shown = std::mem::take(shown);
+                if Arc::make_mut(&mut sensor).complete(&shown, &self.known)? {
+                    self.shown = None;
+                }
+            }
+        }
+        Ok(self.sensor.insert(sensor).clone())
+    }
+}
