@@ -82,9 +82,10 @@ impl StallingViewer {
         (head[0] == 0x81, read(length))
     }
 
-    /// Subscribes to all topics once they exist.
+    /// Subscribes to all topics: the first that a viewer is told of are all of them, whenever it connects. The server would not
+    /// know the channel of one that it has just told.
     fn subscribe(&mut self) {
-        while self.topics.len() < TOPICS.len() {
+        while self.topics.is_empty() {
             let (true, text) = self.receive() else {
                 panic!("data without a subscription");
             };
@@ -94,6 +95,9 @@ impl StallingViewer {
                 self.topics.push((channel["id"].as_u64().unwrap(), topic));
             }
         }
+        let mut topics: Vec<&str> = self.topics.iter().map(|it| it.1.as_str()).collect();
+        topics.sort_unstable();
+        assert_eq!(topics, TOPICS);
         let subscriptions = self
             .topics
             .iter()

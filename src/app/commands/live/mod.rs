@@ -24,9 +24,9 @@ use super::localize::tracking::start;
 use super::localize::{DriveArgs, Recorded, run_with, start_pose};
 use super::motion_source::MotionSource;
 use crate::app::report::Report;
-#[cfg(feature = "viewer")]
-use crate::app::report::export::Viewer;
 use crate::app::report::export::{McapFile, Sinks, unfinished_log};
+#[cfg(feature = "viewer")]
+use crate::app::report::export::{Viewer, live_topics};
 use crate::app::run::arguments::yaml;
 use crate::app::run::{Claims, ConfigArgs, Context, Outputs, RecordingArgs, RunArgs};
 use crate::app::settings::LocalizationConfig;
@@ -282,7 +282,7 @@ fn sinks(args: &LiveArgs) -> Result<Sinks> {
 
 #[cfg(feature = "viewer")]
 fn serve(sinks: &mut Sinks, address: SocketAddr) -> Result<()> {
-    let viewer = Viewer::listen(address)?;
+    let viewer = Viewer::listen(address, &live_topics()?)?;
     let address = viewer.address;
     tracing::info!("Foxglove: open the connection ws://{address}");
     if !address.ip().is_loopback() {

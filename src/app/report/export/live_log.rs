@@ -7,12 +7,16 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
+#[cfg(feature = "viewer")]
+use foxglove::messages::{FrameTransform, Log, Odometry, PointCloud, PosesInFrame, SceneUpdate};
 use serde_json::json;
 
 use super::log::MOST_POINTS;
 use super::messages::{
     cloud, map_scene, nanoseconds, odometry, particles, state_change, transform,
 };
+#[cfg(feature = "viewer")]
+use super::sinks::Topic;
 use super::sinks::{MessageSink, Sinks};
 use crate::app::report::run_output::particle_rows;
 use crate::evaluation::trust::Axes;
@@ -26,6 +30,20 @@ const MOST_WAITING: usize = 32;
 
 /// Time between flushes of the log.
 const FLUSH: Duration = Duration::from_secs(1);
+
+/// The topics of all messages.
+#[cfg(feature = "viewer")]
+pub fn live_topics() -> Result<[Topic; 7]> {
+    Ok([
+        Topic::of::<SceneUpdate>("/map")?,
+        Topic::of::<Log>("/state")?,
+        Topic::of::<FrameTransform>("/tf")?,
+        Topic::of::<Odometry>("/estimate")?,
+        Topic::of::<PosesInFrame>("/particles")?,
+        Topic::of::<PointCloud>("/scan")?,
+        Topic::of_numbers("/numbers"),
+    ])
+}
 
 /// A frame that was localized.
 pub struct LiveFrame {

@@ -10,6 +10,7 @@ use nalgebra::Matrix3;
 
 use super::glb::Model;
 use crate::app::report::plotting::color::Rgb;
+use crate::app::report::plotting::muted;
 use crate::evaluation::ParticleRow;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose3_from_pose2};
 use crate::lidar::Scan;
@@ -65,10 +66,10 @@ pub fn state_change(message: String, is_believed: bool, stamp: u64) -> Log {
     }
 }
 
-/// The mesh of a map as a glTF model.
+/// The mesh of a map as a glTF model, in colours on which scan and particles are seen.
 pub fn map_scene(mesh: &TriangleMesh, stamp: u64) -> Result<SceneUpdate> {
     let mut model = Model::default();
-    model.add_mesh(MAP, mesh);
+    model.add_mesh(MAP, &muted(mesh));
     let mut data = Vec::new();
     model.write(&mut data)?;
     let one = Vector3 {

@@ -12,6 +12,8 @@ mod glb;
 pub mod tiles;
 
 pub use glb::{Model, Ribbon};
+#[cfg(feature = "viewer")]
+pub use live_log::live_topics;
 pub use live_log::{LiveFrame, LiveLog, live_log};
 pub use log::{MOST_POINTS, RunLog, write_mcap};
 pub use sinks::{McapFile, Sinks, unfinished_log};

@@ -14,15 +14,40 @@ use serde_json::Value;
 use crate::files::GrowingFile;
 use crate::georeference::Georeference;
 
+/// A topic, and how its messages are encoded.
+pub struct Topic {
+    pub name: &'static str,
+    pub schema: Schema,
+    pub encoding: String,
+}
+
+impl Topic {
+    /// That of messages of Foxglove.
+    pub fn of<M: Encode>(name: &'static str) -> Result<Self> {
+        Ok(Self {
+            name,
+            schema: M::get_schema().context("the message has no schema")?,
+            encoding: M::get_message_encoding(),
+        })
+    }
+
+    /// That of numbers of a frame as JSON.
+    pub fn of_numbers(name: &'static str) -> Self {
+        const SCHEMA: &str = include_str!("frame.schema.json");
+        Self {
+            name,
+            schema: Schema::new("fpmcl.Frame", "jsonschema", SCHEMA.as_bytes()),
+            encoding: "json".to_owned(),
+        }
+    }
+}
+
 /// An encoded message.
 pub struct Message<'a> {
     /// Its topic.
-    pub topic: &'static str,
+    pub topic: &'a Topic,
     /// Its time [ns].
     pub stamp: u64,
-    /// Its schema, and how it is encoded.
-    pub schema: &'a Schema,
-    pub encoding: &'a str,
     /// Its bytes.
     pub data: &'a [u8],
 }
@@ -47,26 +72,20 @@ impl dyn MessageSink + '_ {
     where
         M::Error: Send + Sync + 'static,
     {
-        let schema = M::get_schema().context("the message has no schema")?;
         let mut data = Vec::with_capacity(message.encoded_len().unwrap_or(0));
         message.encode(&mut data)?;
         self.write(&Message {
-            topic,
+            topic: &Topic::of::<M>(topic)?,
             stamp,
-            schema: &schema,
-            encoding: &M::get_message_encoding(),
             data: &data,
         })
     }
 
     /// Encodes numbers of a frame as JSON.
     pub fn send_json(&mut self, topic: &'static str, stamp: u64, message: &Value) -> Result<()> {
-        const SCHEMA: &str = include_str!("frame.schema.json");
         self.write(&Message {
-            topic,
+            topic: &Topic::of_numbers(topic),
             stamp,
-            schema: &Schema::new("fpmcl.Frame", "jsonschema", SCHEMA.as_bytes()),
-            encoding: "json",
             data: &serde_json::to_vec(message)?,
         })
     }
@@ -108,20 +127,15 @@ impl<W: Write + Seek> McapSink<W> {
 
 impl<W: Write + Seek> MessageSink for McapSink<W> {
     fn write(&mut self, message: &Message) -> Result<()> {
-        let Message {
-            topic,
-            stamp,
-            schema,
-            encoding,
-            data,
-        } = *message;
-        let channel_id = match self.channels.get(topic) {
+        let Message { topic, stamp, data } = *message;
+        let channel_id = match self.channels.get(topic.name) {
             Some(&channel) => channel,
             None => {
-                let writer = &mut self.writer;
+                let (writer, schema) = (&mut self.writer, &topic.schema);
                 let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data)?;
-                let channel = writer.add_channel(schema, topic, encoding, &BTreeMap::new())?;
-                self.channels.insert(topic, channel);
+                let (name, none) = (topic.name, BTreeMap::new());
+                let channel = writer.add_channel(schema, name, &topic.encoding, &none)?;
+                self.channels.insert(name, channel);
                 channel
             }
         };
@@ -266,10 +280,8 @@ mod tests {
 
         fn finish(&mut self) -> Result<()> {
             self.write(&Message {
-                topic: "",
+                topic: &Topic::of_numbers("/numbers"),
                 stamp: 0,
-                schema: &Schema::new("", "", &[] as &[u8]),
-                encoding: "",
                 data: &[],
             })
         }

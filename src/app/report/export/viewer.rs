@@ -7,11 +7,11 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, bail};
 use foxglove::websocket::{ChannelView, Client, ServerListener};
 use foxglove::{Context, PartialMetadata, RawChannel, WebSocketServer};
 
-use super::sinks::{Message, MessageSink};
+use super::sinks::{Message, MessageSink, Topic};
 
 /// Messages that wait for a slow viewer: those of about ten frames.
 const MOST_WAITING: usize = 64;
@@ -21,7 +21,6 @@ const LATCHED: [&str; 2] = ["/map", "/state"];
 
 /// The server. Viewers are served until the process ends.
 pub struct Viewer {
-    context: Arc<Context>,
     channels: BTreeMap<&'static str, Arc<RawChannel>>,
     latched: Arc<Latched>,
     /// The address at which it listens.
@@ -56,9 +55,17 @@ impl ServerListener for Latched {
 }
 
 impl Viewer {
-    /// Listens at an address; with port 0, at any free port.
-    pub fn listen(address: SocketAddr) -> Result<Self> {
+    /// Serves topics at an address; with port 0, at any free port.
+    pub fn listen(address: SocketAddr, topics: &[Topic]) -> Result<Self> {
         let (context, latched) = (Context::new(), Arc::<Latched>::default());
+        // Before the first viewer: one that is told of a channel that is made later may subscribe to it sooner than the server knows.
+        let channels = topics.iter().map(|topic| {
+            let builder = (context.channel_builder(topic.name))
+                .message_encoding(&topic.encoding)
+                .schema(topic.schema.clone());
+            anyhow::Ok((topic.name, builder.build_raw()?))
+        });
+        let channels = channels.collect::<Result<_>>()?;
         let host = match address {
             SocketAddr::V4(address) => address.ip().to_string(),
             SocketAddr::V6(address) => format!("[{}]", address.ip()),
@@ -75,35 +82,25 @@ impl Viewer {
             })?;
         Ok(Self {
             address: SocketAddr::new(address.ip(), server.port()),
-            context,
-            channels: BTreeMap::new(),
+            channels,
             latched,
         })
-    }
-
-    /// The channel of a message, made when it is first used.
-    fn channel(&mut self, message: &Message) -> Result<Arc<RawChannel>> {
-        if let Some(channel) = self.channels.get(message.topic) {
-            return Ok(channel.clone());
-        }
-        let builder = self.context.channel_builder(message.topic);
-        let builder = builder.message_encoding(message.encoding);
-        let channel = builder.schema(message.schema.clone()).build_raw()?;
-        self.channels.insert(message.topic, channel.clone());
-        Ok(channel)
     }
 }
 
 impl MessageSink for Viewer {
     fn write(&mut self, message: &Message) -> Result<()> {
-        let channel = self.channel(message)?;
-        if LATCHED.contains(&message.topic) {
+        let topic = message.topic.name;
+        let Some(channel) = self.channels.get(topic) else {
+            bail!("{topic} is not served");
+        };
+        if LATCHED.contains(&topic) {
             let latched = LatchedMessage {
                 channel: channel.clone(),
                 stamp: message.stamp,
                 data: message.data.to_vec(),
             };
-            self.latched.messages().insert(message.topic, latched);
+            self.latched.messages().insert(topic, latched);
         }
         channel.log_with_meta(message.data, PartialMetadata::with_log_time(message.stamp));
         Ok(())
