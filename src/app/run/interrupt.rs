@@ -35,7 +35,7 @@ const SIGNALS: [i32; 10] = [
 const GRACE: Duration = Duration::from_millis(800);
 
 /// Longest time that the end of a process waits for a message: a terminal may be stopped, or a pipe full.
-const MESSAGE_WAIT: Duration = Duration::from_millis(200);
+const MESSAGE_WAIT: Duration = Duration::from_millis(500);
 
 /// Time between two looks at the request.
 const POLL: Duration = Duration::from_millis(20);
