@@ -1,25 +1,29 @@
-"""Measures the tables of `docs/benchmarks.md` and prints their rows.
+"""Measures the tables of `docs/benchmarks.md`, and those of thresholds in `docs/method.md`, and prints their rows.
 
     cargo build --release
     python benches/measure.py [SUBJECT ...] [--seeds 1,2,3,4,5] [--work results/measure]
 
-Subjects: drive_0005, kitti_07, odometry, benchmark, ground, demo, poisson, rays, basin, starts; all by default. A subject
-whose recording, package or program is absent is skipped with a line that names it. Recordings are below the folder in
-`FPMCL_DATA`, by default `../shared/data`; the simulated drives are made in the folder of the work, where finished
+Subjects: drive_0005, kitti_07, odometry, benchmark, ground, demo, poisson, rays, basin, starts, thresholds; all by default.
+A subject whose recording, package or program is absent is skipped with a line that names it. Recordings are below the
+folder in `FPMCL_DATA`, by default `../shared/data`; the simulated drives are made in the folder of the work, where finished
 maps are kept for the next call. The numbers of one call belong to one commit and one machine, which head the output.
 Times are those of an otherwise idle machine.
 """
 
 import argparse
+import csv
 import importlib.util
 import json
 import math
 import os
 import pathlib
 import platform
+import re
+import shutil
 import statistics
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 DATA = pathlib.Path(os.environ.get("FPMCL_DATA", ROOT / "../shared/data")).resolve()
@@ -281,7 +285,230 @@ def starts(work, _seeds):
     block(bench("starts", file, second, FPMCL_STARTS="40"))
 
 
-SUBJECTS = [drive_0005, kitti_07, odometry, benchmark, ground, demo, poisson, rays, basin, starts]
+# Keys that `thresholds` halves and doubles; of shares it halves and doubles the odds.
+KEYS = {
+    "tracking_loss": "tolerance_m min_agreement lost_fraction sure_agreement confirming_agreement sure_spread_m".split(),
+    "places": "radius_m tolerance_m scale_m likely_weight given_up_weight".split(),
+    "proposal.registration": "kernel_m sectors map_error_m".split(),
+    "smoothing": "odometry_ahead_m odometry_aside_m odometry_turn_rad robust_sigmas".split(),
+    "visibility": "point_margin_m triangle_margin_m crossing_m support_m support_range_m point_votes triangle_votes".split(),
+    "loop_closure": "min_similarity min_common_share surface_tolerance drift_share remaining_drift_share".split(),
+}
+
+
+
+def keys(*blocks):
+    return [f"{block}.{key}" for block in blocks for key in KEYS[block]]
+
+
+def settings(*values):
+    return [word for value in values for word in ("--set", value)]
+
+
+def default_of(command, key):
+    text = fpmcl("config", command, "--full")
+    for part in key.split("."):
+        text = text[re.search(rf"^ *{part}:", text, re.MULTILINE).end() :]
+    return float(text.split(maxsplit=1)[0])
+
+
+def scaled(command, key, factor):
+    value = default_of(command, key)
+    is_share = re.search("agreement|fraction|share|similarity", key)
+    return f"{key}={factor * value / (1 + (factor - 1) * value * bool(is_share)):.3g}"
+
+
+def sensitivity(title, command, varied, names, measured):
+    """Prints what is `measured` of each recording with half of each key, its default and twice of it; keys with a blank between
+    them change together."""
+
+    def cell(name, values):
+        try:
+            return measured(name, values)
+        except subprocess.CalledProcessError:
+            return "error"
+
+    print(f"{title}:\n")
+    table("key", "half, default, twice", *names)
+    # Each call of the program has one thread.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        default = {name: pool.submit(cell, name, []) for name in names}
+        found = []
+        for key in varied:
+            values = [[scaled(command, part, factor) for part in key.split()] for factor in (0.5, 1, 2)]
+            half, twice = ({name: pool.submit(cell, name, value) for name in names} for value in values[::2])
+            cells = [[half[name], default[name], twice[name]] for name in names]
+            found.append((key, [" ".join(it.split("=")[1] for it in value) for value in values], cells))
+        for key, values, cells in found:
+            texts = [[it.result() for it in futures] for futures in cells]
+            # What does not depend on the key is printed once.
+            different = [text if len(set(text)) > 1 else text[:1] for text in texts]
+            row(", ".join(f"`{part}`" for part in key.split()), ", ".join(values), *map(" / ".join, different))
+    print()
+
+
+def mirrored(recording, folder):
+    """Writes a recording with the other sign of y, which fits no map."""
+    for file in (file for file in recording.rglob("*") if file.is_file()):
+        data, target = bytearray(file.read_bytes()), folder / file.relative_to(recording)
+        if file.suffix in (".bin", ".pcd"):
+            head, size = 0, 20 if file.name.endswith(".pcd.bin") else 16
+            if file.suffix == ".pcd":
+                head = re.search(b"DATA binary\n", data).end()
+                size = sum(map(int, re.search(rb"SIZE ([\d ]+)", data)[1].split()))
+            # The sign is the highest bit of the last byte of y.
+            for last in range(head + 7, len(data), size):
+                data[last] ^= 0x80
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+    return folder
+
+
+def block_drive(work, beams):
+    """Simulates a drive around a block, with a rolling shutter, that ends where it began."""
+    drive = work / f"{beams}-beams/drive_1"
+    if not drive.exists():
+        sides = "{length_m: 50}, {length_m: 20, turn_deg: 90}, {length_m: 40}, {length_m: 20, turn_deg: 90}, "
+        path = f"path=[{2 * sides}{{length_m: 50}}]"
+        scanner = [f"scanner.beams={beams}", "scanner.rolling_shutter=true"]
+        fpmcl("simulate", *settings(f"output_folder={drive.parent}", path, *scanner))
+    return drive
+
+
+def thresholds(work, _seeds):
+    work = work / "thresholds"
+    brief = ["--threads", "1", "--force", "--quiet", *settings("output.plots=false")]
+    # The 16 beams have the poses of a map of all scans.
+    truth = {
+        "nuscenes-hdl32": DATA / "nuscenes-hdl32/poses_tum.txt",
+        "vlp16-raw": work / "vlp16-raw/all.poses_tum.txt",
+        "livox-hku1": DATA / "livox-hku1/optimized_poses.txt",
+        "livox-hku2": DATA / "livox-hku2/optimized_poses.txt",
+        "os1-thinned": DATA / "os1-thinned/slam_poses.txt",
+    }
+    sensors = [DRIVE_0005.name, "nuscenes-hdl32", "vlp16-raw", "livox-hku1"]
+    for name in {*sensors, *truth}:
+        require(DATA / name)
+    if not truth["vlp16-raw"].exists():
+        fpmcl("build-map", DATA / "vlp16-raw", "--output", work / "vlp16-raw/all.ply", *brief)
+
+    def folder_of(name, values, kind):
+        return work / name / kind / ("_".join(values) or "default")
+
+    def map_with(name, values=()):
+        file = folder_of(name, values, "map") / "map.ply"
+        if not file.exists():
+            poses = ["--poses", truth[name]] if name == "vlp16-raw" else []
+            even = settings("frame_step=2", f"n_scans={min(160, scans(name))}", *values)
+            fpmcl("build-map", DATA / name, *poses, "--output", file, *even, *brief)
+        return file
+
+    def localized(name, folder, values=(), file=None, recording=None):
+        """Localizes 40 odd scans in the map of the even ones."""
+        odd = settings("start_idx=1", "frame_step=2", f"n_scans={min(80, scans(name) - 1)}", *values)
+        truths = TRUTH_0005 if name == DRIVE_0005.name else ["--truth", truth[name]]
+        chosen = [recording or DATA / name, "--map", file or map_with(name), *truths]
+        try:
+            fpmcl("localize", *chosen, "--output", folder / "result.npz", "--seed", 1, *odd, *brief)
+        except subprocess.CalledProcessError as error:
+            # Less than half of the frames are tracking.
+            if error.returncode != 3:
+                raise
+        return judged(folder, "mcl")
+
+    def scans(name):
+        return sum(file.suffix in (".bin", ".pcd") for file in (DATA / name).rglob("*"))
+
+    def judged(folder, run_of):
+        """Frames that are tracking, frames of them that are wrong, position error and squared error."""
+        with open(folder / "frames.csv", newline="") as file:
+            frames = [it for it in csv.DictReader(file) if it["state"] == "tracking"]
+        wrong = sum(float(it["mcl_position_error_m"]) > 0.5 for it in frames)
+        found = json.loads((folder / "report.json").read_text())[run_of]
+        error = "-"
+        if found and found["consistency"]:
+            error_cm = 100 * found["metrics"]["position_m"]["rmse"]
+            error = f"{error_cm:.2f} cm, {found['consistency']['squared_error']:.1f}"
+        return f"{len(frames)}, {wrong}, {error}"
+
+    def tracked(name, values):
+        return localized(name, folder_of(name, values, "tracked"), values)
+
+    def tracked_mirrored(name, values):
+        recording = work / name / "mirrored"
+        found = localized(name, folder_of(name, values, "tracked_mirrored"), values, recording=recording)
+        return found.split(", ")[1]
+
+    def smoothed(name, values):
+        folder = folder_of(name, values, "smoothed")
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(folder_of(name, [], "tracked"), folder)
+        fpmcl("refine", folder / "result.npz", "--seed", 1, *settings(*values), *brief)
+        return judged(folder, "refined")
+
+    def voted(name, values):
+        file = map_with(name, values)
+        maps = json.loads(file.with_suffix(".report.json").read_text())["local_maps"]
+        gone = sum(it["dynamic_points"] + it["crossed_triangles"] for it in maps)
+        return f"{gone}, {localized(name, folder_of(name, values, 'voted'), file=file)}"
+
+    def closed(name, values):
+        folder = folder_of(name, values, "closed")
+        fpmcl("odometry", with_loops[name], "--output", folder, *settings("adjust=false", *values), *brief)
+        poses = truth.get(name, with_loops[name] / "poses.txt")
+        rows = [[float(word) for word in line.split()] for line in poses.read_text().splitlines()]
+        loops = json.loads((folder / "report.json").read_text())["found_loops"]
+        loops = [it for it in loops if it["verdict"] == "accepted"]
+        off_m = [it["distance_m"] - math.dist(rows[it["first"]][3::4], rows[it["second"]][3::4]) for it in loops]
+        return f"{len(loops)}, {sum(abs(it) > 1 for it in off_m)}"
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(map_with, sensors))
+        list(pool.map(lambda name: mirrored(DATA / name, work / name / "mirrored"), sensors))
+    errors = "position error, squared error over the covariance"
+    found = f"Frames tracking, wrong ones among them, {errors}"
+    of_filter = keys("tracking_loss", "places", "proposal.registration")
+    sensitivity(f"{found} of `localize`", "localize", of_filter, sensors, tracked)
+    shares = [key for key in keys("tracking_loss") if "agreement" in key]
+    shares.append(" ".join(shares))
+    sensitivity("Wrong frames of the mirrored recording", "localize", shares, sensors, tracked_mirrored)
+    sensitivity(f"{found} of `refine`", "refine", keys("smoothing"), sensors, smoothed)
+    sensitivity("Points and triangles removed, then as for `localize`", "build-map", keys("visibility"), sensors, voted)
+    with_loops = {name: DATA / name for name in ("livox-hku1", "os1-thinned")}
+    with_loops["livox-hku2"] = DATA / "livox-hku2/scans"
+    with_loops.update({f"{beams} beams, simulated": block_drive(work, beams) for beams in (64, 16)})
+    sensitivity("Accepted loops, false ones among them", "odometry", keys("loop_closure"), with_loops, closed)
+    timings(work)
+
+
+def timings(work):
+    """Prints how the residuals of the odometry differ with the times of the points, over runs of 16 scans."""
+    recordings = [DRIVE_0005, DATA / "semantickitti-00-labels", DATA / "vlp16-raw"]
+    recordings += [block_drive(work, beams) for beams in (64, 16)]
+    print("Times with the least residual, spread over it, and margin over the spread:\n")
+    table("recording", "least", "spread", "margin")
+    for recording in recordings:
+        found = []
+        for first in (0, 16, 32, 44):
+            chosen = settings(f"start_idx={first}", "n_scans=16", "loops=false", "adjust=false", "output.plots=false")
+            folder = work / "timing"
+            command = [PROGRAM, "odometry", recording, "--output", folder, "--force", "-vv", *chosen]
+            log = subprocess.run([str(word) for word in command], capture_output=True, text=True).stderr
+            least_mm = {}
+            for kind, text in re.findall(r"(None|Order|\w*[cC]lockwise).*mean residual ([\d.]+) mm", log):
+                least_mm[kind] = min(float(text), least_mm.get(kind, math.inf))
+            if len(least_mm) > 1:
+                values = sorted(least_mm.values())
+                spread = values[-1] - values[0]
+                share, margin = spread / values[0], (values[1] - values[0]) / spread
+                found.append((min(least_mm, key=least_mm.get), f"{share:.2f}", f"{margin:.2f}"))
+        name = recording.name if recording.is_relative_to(DATA) else recording.parent.name
+        row(name, *map(", ".join, zip(*found)))
+
+
+SUBJECTS = [
+    drive_0005, kitti_07, odometry, benchmark, ground, demo, poisson, rays, basin, starts, thresholds
+]
 
 
 def processor():
