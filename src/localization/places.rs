@@ -21,7 +21,7 @@ use crate::validation::{InvalidValue, Validate, fraction, in_range, not_negative
 
 /// Search among several places.
 ///
-/// Defaults: values of this project.
+/// Defaults: values of this project; `docs/method.md`, Thresholds, has what half and twice of them change on four sensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]

@@ -30,7 +30,8 @@ pub struct TimingComparison {
 }
 
 /// Smallest difference between the largest and the least residual that decides, as a share of the least. Errors of wrong times
-/// add to those of the scans in squares: this share is theirs if they are a third of these, √(1.05² − 1).
+/// add to those of the scans in squares: this share is theirs if they are a third of these, √(1.05² − 1). `docs/method.md`,
+/// Thresholds, has the shares of real and simulated sensors.
 const SPREAD: f64 = 0.05;
 
 /// A run of scans whose timing cannot be compared.

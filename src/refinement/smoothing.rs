@@ -26,7 +26,8 @@ use crate::validation::{InvalidValue, Validate, in_range, positive};
 /// Least noise of the odometry and robustness against wrong frames.
 ///
 /// Defaults: an odometry of KITTI's quality: 2 cm and 0.06 degrees per frame. Where the measured poses of neighbours
-/// show that it is worse, it is taken as worse.
+/// show that it is worse, it is taken as worse. `docs/method.md`, Thresholds, has what half and twice of them change on four
+/// sensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]

@@ -8,7 +8,8 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 
 /// Settings of the registration.
 ///
-/// Defaults: our own values; from 1.5 degrees away it takes up to ten iterations.
+/// Defaults: our own values; from 1.5 degrees away it takes up to ten iterations. `docs/method.md`, Thresholds, has what half and
+/// twice of the kernel, the sectors and the error of the map change on four sensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
@@ -16,7 +17,8 @@ pub struct RegistrationConfig {
     /// Maximum number of Gauss-Newton iterations.
     #[default(12)]
     pub iterations: usize,
-    /// Scale c of the robust kernel: a residual of c has a weight of one quarter [m].
+    /// Scale c of the robust kernel: a residual of c has a weight of one quarter [m]. The default is five standard deviations of
+    /// the ranges of an HDL-64E, 2 cm, so that 98 % of the information of normal residuals is used; with 3 cm it is 93 %.
     #[default(0.1)]
     pub kernel_m: f64,
     /// Step length below which the iteration has converged [m]; rotations count with a lever of ten
