@@ -24,7 +24,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let recording = Recording::open(recording)?;
     let config = TrackerConfig::default();
     let mut monitor = Monitor::new(&config.localizer);
-    let mut tracker = Tracker::new(&map, config)?;
+    let mut tracker = Tracker::new(&map, config)?.in_real_time();
     let (inbox, mut latencies) = (Inbox::new(1), Latencies::default());
     thread::scope(|scope| {
         scope.spawn(|| {

@@ -2,6 +2,8 @@
 
 use std::borrow::Cow;
 use std::sync::Arc;
+use std::sync::mpsc::{Receiver, TryRecvError, channel};
+use std::thread;
 
 use super::error::TrackerError;
 use crate::geometry::Pose3;
@@ -18,12 +20,19 @@ pub struct FrontEnd {
     sensor: Option<Arc<Sensor>>,
     /// The last scans, while an inferred sensor is not complete.
     shown: Option<Vec<Scan>>,
+    /// Whether no scan waits for the sensor to be completed.
+    is_real_time: bool,
+    /// The thread in which it is completed.
+    completing: Option<Receiver<Result<Completed, SensorError>>>,
     odometry: Option<OdometryConfig>,
     /// `None` where it is not wanted, and since it missed a scan.
     odometer: Option<Odometer>,
     /// Motion over the scans since the last one that was measured.
     since_measured: Pose3,
 }
+
+/// A sensor and whether scans showed all of it.
+type Completed = (Sensor, bool);
 
 /// What is known about a scan before it is localized.
 #[derive(Clone, Debug)]
@@ -43,6 +52,8 @@ impl FrontEnd {
         let sensor = Sensor::configured(&known).map(Arc::new);
         Ok(Self {
             shown: sensor.is_none().then(Vec::new),
+            is_real_time: false,
+            completing: None,
             sensor,
             odometer: odometry.clone().map(Odometer::new).transpose()?,
             odometry,
@@ -54,6 +65,10 @@ impl FrontEnd {
     pub(super) fn set_sensor(&mut self, sensor: Sensor) {
         self.sensor = Some(Arc::new(sensor.with_known(&self.known)));
         self.shown = None;
+    }
+
+    pub(super) fn set_real_time(&mut self) {
+        self.is_real_time = true;
     }
 
     /// Forgets all scans but what they showed about the sensor.
@@ -123,17 +138,55 @@ impl FrontEnd {
 
     /// The sensor, about which a scan may show more.
     fn learn(&mut self, scan: &Scan) -> Result<Arc<Sensor>, SensorError> {
-        let mut sensor = self.sensor_in(scan)?;
-        if let Some(shown) = &mut self.shown {
-            shown.push(scan.clone());
-            if shown.len() == TIMING_SCANS {
-                // What cannot be learned from these scans may be learned from the next ones.
-                let shown = std::mem::take(shown);
-                if Arc::make_mut(&mut sensor).complete(&shown, &self.known)? {
-                    self.shown = None;
+        let sensor = self.sensor_in(scan)?;
+        self.sensor = Some(sensor.clone());
+        if let Some(completing) = &self.completing {
+            match completing.try_recv() {
+                Err(TryRecvError::Empty) => return Ok(sensor),
+                Err(TryRecvError::Disconnected) => self.completing = None,
+                Ok(completed) => {
+                    self.completing = None;
+                    let completed = completed?;
+                    return Ok(self.take(completed));
                 }
             }
         }
-        Ok(self.sensor.insert(sensor).clone())
+        let Some(shown) = &mut self.shown else {
+            return Ok(sensor);
+        };
+        shown.push(scan.clone());
+        if shown.len() < TIMING_SCANS {
+            return Ok(sensor);
+        }
+        let (shown, known) = (std::mem::take(shown), self.known.clone());
+        let before = Sensor::clone(&sensor);
+        let complete = move || {
+            let mut sensor = before;
+            let is_complete = sensor.complete(&shown, &known)?;
+            Ok((sensor, is_complete))
+        };
+        if !self.is_real_time {
+            let completed = complete()?;
+            return Ok(self.take(completed));
+        }
+        let (sender, completing) = channel();
+        self.completing = Some(completing);
+        thread::spawn(move || {
+            // The other cores are for the scans. Nobody waits any more where the send fails.
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
+            let _ = sender.send(match pool {
+                Ok(pool) => pool.install(complete),
+                Err(_) => complete(),
+            });
+        });
+        Ok(sensor)
+    }
+
+    /// Takes over a sensor. What could not be learned from these scans may be learned from the next ones.
+    fn take(&mut self, (sensor, is_complete): Completed) -> Arc<Sensor> {
+        if is_complete {
+            self.shown = None;
+        }
+        self.sensor.insert(Arc::new(sensor)).clone()
     }
 }

@@ -94,6 +94,14 @@ impl Tracker {
         self
     }
 
+    /// The same tracker for scans that do not wait: an inferred sensor is completed in a thread of its own, which takes seconds
+    /// where times of points are compared. Which scan is the first with the complete sensor depends on the machine.
+    #[must_use]
+    pub fn in_real_time(mut self) -> Self {
+        self.front.set_real_time();
+        self
+    }
+
     /// Forgets all scans but what they showed about the sensor: the next one is the first, at a start.
     ///
     /// # Errors

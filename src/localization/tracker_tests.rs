@@ -5,7 +5,7 @@ use crate::geometry::Pose2;
 use crate::localization::{StartSpread, State};
 use crate::map::world_for_tests::TestWorld;
 use crate::odometry::Odometer;
-use crate::sensor::SensorError;
+use crate::sensor::{SensorError, TIMING_SCANS};
 
 fn config() -> TrackerConfig {
     TrackerConfig {
@@ -16,7 +16,11 @@ fn config() -> TrackerConfig {
 
 /// A drive along the street, 0.8 m per scan: poses and scans.
 fn drive(world: &TestWorld) -> Vec<(Pose2, Scan)> {
-    (0..12)
+    drive_of(12, world)
+}
+
+fn drive_of(scans: u32, world: &TestWorld) -> Vec<(Pose2, Scan)> {
+    (0..scans)
         .map(|number| {
             let pose = world.pose_at(10.0 + 0.8 * f64::from(number), 0.3, 0.02);
             let scan = Scan {
@@ -102,6 +106,33 @@ fn the_front_end_may_be_a_scan_ahead() {
         let expected = in_turn.step(scan).unwrap();
         assert_eq!(estimate.particles, expected.particles, "scan {row}");
     }
+}
+
+#[test]
+fn in_real_time_the_sensor_is_completed_while_scans_pass() {
+    let world = TestWorld::street();
+    let drive = drive_of(TIMING_SCANS as u32, &world);
+    let tracker = || Tracker::new(&world.map(), config()).unwrap();
+    let (mut at_once, mut in_real_time) = (tracker(), tracker().in_real_time());
+    for (row, (_, scan)) in drive.iter().enumerate() {
+        for tracker in [&mut at_once, &mut in_real_time] {
+            tracker.split().0.pass(scan).unwrap();
+        }
+        assert!(row > 0 || at_once.sensor() == in_real_time.sensor());
+    }
+    let expected = at_once.sensor().unwrap();
+    assert!(expected.is_moving);
+    assert!(
+        !in_real_time.sensor().unwrap().is_moving,
+        "the last scan waited"
+    );
+    let is_completed = (1..1000).any(|count| {
+        let mut scan = drive[drive.len() - 1].1.clone();
+        scan.time_s = scan.time_s.map(|time_s| time_s + 0.1 * f64::from(count));
+        in_real_time.split().0.pass(&scan).unwrap();
+        in_real_time.sensor() == Some(expected)
+    });
+    assert!(is_completed);
 }
 
 #[test]

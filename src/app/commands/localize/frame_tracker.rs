@@ -72,9 +72,11 @@ impl<'a> FrameTracker<'a> {
             ..config.tracker.clone()
         };
         let mut tracker = Tracker::new(map, tracker)?;
-        if let Some(sensor) = sensor {
-            tracker = tracker.with_sensor(sensor.clone());
-        }
+        tracker = match sensor {
+            Some(sensor) => tracker.with_sensor(sensor.clone()),
+            // That of a robot.
+            None => tracker.in_real_time(),
+        };
         let sensor = sensor.as_ref().filter(|_| config.refine);
         let seed = config.tracker.seed;
         let refiner = sensor.map(|it| TrajectoryRefiner::new(map, it, config.refiner(), seed));
