@@ -27,11 +27,10 @@ pub fn localize<'a>(
     let mut tracker = FrameTracker::new(opened, motion, start)?;
     let task = (context.progress).task("localize", opened.recording.frames.len());
     let mut frames = opened.recording.frames.iter();
-    let mut next = frames.next().map(|first| tracker.begin(first));
+    let is_requested = || context.interrupt.requested();
+    let first = frames.next().filter(|_| !is_requested());
+    let mut next = first.map(|first| tracker.begin(first));
     while let Some(current) = next {
-        if context.interrupt.requested() {
-            break;
-        }
         let process = || {
             let current = current?;
             let record = |tracked: &TrackedFrame<'_>| {
@@ -48,6 +47,9 @@ pub fn localize<'a>(
             }
         };
         task.advance(1);
+        if is_requested() {
+            break;
+        }
     }
     Ok(())
 }
