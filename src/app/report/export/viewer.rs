@@ -21,6 +21,8 @@ const LATCHED: [&str; 2] = ["/map", "/state"];
 
 /// The server. Viewers are served until the process ends.
 pub struct Viewer {
+    /// Channels and viewers end with it.
+    _context: Arc<Context>,
     channels: BTreeMap<&'static str, Arc<RawChannel>>,
     latched: Arc<Latched>,
     /// The address at which it listens.
@@ -82,6 +84,7 @@ impl Viewer {
             })?;
         Ok(Self {
             address: SocketAddr::new(address.ip(), server.port()),
+            _context: context,
             channels,
             latched,
         })
