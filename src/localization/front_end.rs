@@ -2,8 +2,7 @@
 
 use std::borrow::Cow;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, TryRecvError, channel};
-use std::thread;
+use std::thread::{self, JoinHandle};
 
 use super::error::TrackerError;
 use crate::geometry::Pose3;
@@ -12,8 +11,8 @@ use crate::odometry::{Odometer, OdometryConfig};
 use crate::sensor::{Sensor, SensorConfig, SensorError, TIMING_SCANS};
 use crate::validation::InvalidValue;
 
-/// The half of a [`Tracker`](super::Tracker) that needs no map. The sensor is given, else inferred from the first scan, and its own car and
-/// the times of points once scans in motion show them.
+/// The half of a [`Tracker`](super::Tracker) that needs no map. The sensor is given, else inferred: from the first scan, its own
+/// car and the times of points once scans in motion show them.
 pub struct FrontEnd {
     known: SensorConfig,
     /// `None` before the first scan, unless it was given.
@@ -23,7 +22,7 @@ pub struct FrontEnd {
     /// Whether no scan waits for the sensor to be completed.
     is_real_time: bool,
     /// The thread in which it is completed.
-    completing: Option<Receiver<Result<Completed, SensorError>>>,
+    completing: Option<JoinHandle<Result<Completed, SensorError>>>,
     odometry: Option<OdometryConfig>,
     /// `None` where it is not wanted, and since it missed a scan.
     odometer: Option<Odometer>,
@@ -105,11 +104,12 @@ impl FrontEnd {
     /// # Errors
     /// The first scan has no points, from which the sensor is inferred, or times of scans do not ascend.
     pub fn measure(&mut self, scan: &Scan) -> Result<Measured, TrackerError> {
-        let measured = self.advance(scan)?;
+        let (sensor, timed) = self.advance(scan)?;
         let motion = std::mem::take(&mut self.since_measured);
         Ok(Measured {
+            sensor,
+            timed,
             previous_from_current: self.odometer.is_some().then_some(motion),
-            ..measured
         })
     }
 
@@ -119,7 +119,8 @@ impl FrontEnd {
         self.measure(scan)
     }
 
-    fn advance(&mut self, scan: &Scan) -> Result<Measured, TrackerError> {
+    /// Takes the next scan; returns its sensor, and the scan with the times of its points where it lacked them.
+    fn advance(&mut self, scan: &Scan) -> Result<(Arc<Sensor>, Option<Scan>), TrackerError> {
         let sensor = self.learn(scan)?;
         let timed = sensor.timed(scan);
         if let Some(odometer) = &mut self.odometer {
@@ -129,29 +130,21 @@ impl FrontEnd {
             Cow::Borrowed(_) => None,
             Cow::Owned(timed) => Some(timed),
         };
-        Ok(Measured {
-            sensor,
-            timed,
-            previous_from_current: None,
-        })
+        Ok((sensor, timed))
     }
 
     /// The sensor, about which a scan may show more.
     fn learn(&mut self, scan: &Scan) -> Result<Arc<Sensor>, SensorError> {
         let sensor = self.sensor_in(scan)?;
         self.sensor = Some(sensor.clone());
-        if let Some(completing) = &self.completing {
-            match completing.try_recv() {
-                Err(TryRecvError::Empty) => return Ok(sensor),
-                Err(TryRecvError::Disconnected) => self.completing = None,
-                Ok(completed) => {
-                    self.completing = None;
-                    let completed = completed?;
-                    return Ok(self.take(completed));
-                }
-            }
+        // A thread that panicked has learned nothing.
+        let finished = self.completing.take_if(|it| it.is_finished());
+        if let Some(Ok(completed)) = finished.map(JoinHandle::join) {
+            let completed = completed?;
+            return Ok(self.take(completed));
         }
-        let Some(shown) = &mut self.shown else {
+        let is_waiting = self.completing.is_some();
+        let Some(shown) = self.shown.as_mut().filter(|_| !is_waiting) else {
             return Ok(sensor);
         };
         shown.push(scan.clone());
@@ -169,16 +162,14 @@ impl FrontEnd {
             let completed = complete()?;
             return Ok(self.take(completed));
         }
-        let (sender, completing) = channel();
-        self.completing = Some(completing);
-        thread::spawn(move || {
-            // The other cores are for the scans. Nobody waits any more where the send fails.
+        self.completing = Some(thread::spawn(move || {
+            // The other cores are for the scans.
             let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
-            let _ = sender.send(match pool {
+            match pool {
                 Ok(pool) => pool.install(complete),
                 Err(_) => complete(),
-            });
-        });
+            }
+        }));
         Ok(sensor)
     }
 
