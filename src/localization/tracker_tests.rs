@@ -41,12 +41,17 @@ fn near(pose: &Pose2) -> Start {
     }
 }
 
+/// A tracker whose start is known and whose sensor is not.
+fn tracker_near(pose: &Pose2, world: &TestWorld) -> Tracker {
+    let tracker = Tracker::new(&world.map(), config()).unwrap();
+    tracker.with_start(near(pose))
+}
+
 #[test]
 fn scans_of_an_unknown_sensor_are_tracked() {
     let world = TestWorld::street();
     let drive = drive(&world);
-    let tracker = Tracker::new(&world.map(), config()).unwrap();
-    let mut tracker = tracker.with_start(near(&drive[0].0));
+    let mut tracker = tracker_near(&drive[0].0, &world);
     assert!(tracker.sensor().is_none());
     for (row, (truth, scan)) in drive.iter().enumerate() {
         let estimate = tracker.step(scan).unwrap();
@@ -86,12 +91,9 @@ fn a_tracker_is_the_odometer_and_the_localizer() {
 #[test]
 fn the_front_end_may_be_a_scan_ahead() {
     let world = TestWorld::street();
-    let drive = drive(&world);
-    // The sensor is complete after some scans, which changes what the localizer leaves out.
-    let tracker = || {
-        let tracker = Tracker::new(&world.map(), config()).unwrap();
-        tracker.with_start(near(&drive[0].0))
-    };
+    // The sensor is complete before the last scans.
+    let drive = drive_of(TIMING_SCANS as u32 + 2, &world);
+    let tracker = || tracker_near(&drive[0].0, &world);
     let (mut in_turn, mut ahead) = (tracker(), tracker());
     let (front, back) = ahead.split();
     let mut next = Some(front.measure(&drive[0].1).unwrap());
@@ -139,10 +141,7 @@ fn in_real_time_the_sensor_is_completed_while_scans_pass() {
 fn a_scan_that_cannot_be_localized_does_not_lose_its_motion() {
     let world = TestWorld::street();
     let drive = drive(&world);
-    let tracker = || {
-        let tracker = Tracker::new(&world.map(), config()).unwrap();
-        tracker.with_start(near(&drive[0].0))
-    };
+    let tracker = || tracker_near(&drive[0].0, &world);
     let (mut found, mut expected) = (tracker(), tracker());
     for (row, (_, scan)) in drive.iter().enumerate() {
         let impossible = Odometry::Increment(Pose2::translation(f64::NAN, 0.0));
