@@ -43,13 +43,13 @@ pub struct FrameTracker<'a> {
     tracker: Tracker,
     /// Frames between those that are localized, of which the odometry of the scans needs all.
     between: VecDeque<Frame>,
-    rest: Rest<'a>,
+    localizer: FrameLocalizer<'a>,
     /// When the last frame was done, before the first when it was begun.
     done: Instant,
 }
 
-/// What is done with a frame that was measured.
-struct Rest<'a> {
+/// Localizes frames that were measured, and refines them.
+struct FrameLocalizer<'a> {
     opened: &'a Opened,
     motion: MotionSource,
     refiner: Option<TrajectoryRefiner>,
@@ -83,7 +83,7 @@ impl<'a> FrameTracker<'a> {
         Ok(Self {
             tracker: tracker.with_start(start),
             between: motion.take_frames_between(),
-            rest: Rest {
+            localizer: FrameLocalizer {
                 opened,
                 motion,
                 refiner: refiner.transpose()?,
@@ -114,9 +114,7 @@ impl<'a> FrameTracker<'a> {
         let started = Instant::now();
         let (front, back) = self.tracker.split();
         let measured = measure(front, &mut self.between, frame, scan)?;
-        let mut tracked = self.rest.step(back, frame, scan, &measured, given)?;
-        tracked.runtimes[0] = started.elapsed() - tracked.runtimes[1];
-        Ok(tracked)
+        (self.localizer).step(back, frame, scan, &measured, given, started)
     }
 
     /// Reads the first frame and measures it.
@@ -126,7 +124,7 @@ impl<'a> FrameTracker<'a> {
     }
 
     /// Localizes a frame and records it, while the next one is read and measured.
-    pub fn step_ahead<'f>(
+    pub fn step_and_read<'f>(
         &mut self,
         current: &MeasuredFrame,
         next: Option<&'f Frame>,
@@ -138,11 +136,10 @@ impl<'a> FrameTracker<'a> {
             measured,
         } = current;
         let (front, back) = self.tracker.split();
-        let (rest, done) = (&mut self.rest, &mut self.done);
+        let (localizer, done) = (&mut self.localizer, &mut self.done);
         let localize = || {
-            let mut tracked = rest.step(back, frame, scan, measured, None)?;
-            let since = std::mem::replace(done, Instant::now());
-            tracked.runtimes[0] = done.duration_since(since) - tracked.runtimes[1];
+            let tracked = localizer.step(back, frame, scan, measured, None, *done)?;
+            *done = Instant::now();
             record(&tracked)
         };
         let read = || next.map(|next| read(front, &mut self.between, next));
@@ -177,8 +174,8 @@ fn measure(
     Ok(front.measure(scan)?)
 }
 
-impl Rest<'_> {
-    /// Localizes a frame and refines it, where every frame is refined.
+impl FrameLocalizer<'_> {
+    /// Localizes a frame and refines it, where every frame is refined. Its time counts from `started`.
     fn step(
         &mut self,
         back: &mut BackEnd,
@@ -186,9 +183,9 @@ impl Rest<'_> {
         scan: &Scan,
         measured: &Measured,
         given: Option<FrameMotion>,
+        started: Instant,
     ) -> Result<TrackedFrame<'_>> {
         let frames = &self.opened.recording.frames;
-        let started = Instant::now();
         let row = frames.partition_point(|it| it.number < frame.number);
         let (since, before_s) = match self.last {
             Some((last, time_s)) => (last + 1, time_s),

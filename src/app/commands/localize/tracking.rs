@@ -36,7 +36,7 @@ pub fn localize<'a>(
             let record = |tracked: &TrackedFrame<'_>| {
                 recorded().record(current.frame, &current.scan, tracked)
             };
-            let (recorded, next) = tracker.step_ahead(&current, frames.next(), record);
+            let (recorded, next) = tracker.step_and_read(&current, frames.next(), record);
             recorded.map(|()| next)
         };
         next = match process() {
