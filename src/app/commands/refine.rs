@@ -409,10 +409,10 @@ fn increments(
                 .map(|motion| motion.increment));
         }
         let mut increment = Pose3::identity();
-        for scan in MotionSource::frames_before(&mut between, frame) {
-            increment *= odometer.step(&scan.read()?)?.previous_from_current;
+        let passed = MotionSource::frames_before(&mut between, frame);
+        for frame in passed.chain([frame.clone()]) {
+            increment *= odometer.step(&frame.read()?)?.previous_from_current;
         }
-        increment *= odometer.step(&frame.read()?)?.previous_from_current;
         Ok(Some(pose2_from_pose3(&increment)))
     };
     sequence.frames.iter().enumerate().map(into_frame).collect()

@@ -313,13 +313,13 @@ impl<'a, 'b> Driver<'a, 'b> {
             let waited = self.drive.recorded_time(waited);
             let period = last.period.unwrap_or(USUAL_PERIOD).min(LONGEST_PERIOD);
             let moved = self.moved_to(time_s, (self.robot.measured)(time_s).as_ref());
-            let silence = if self.rejected() > last.rejected {
+            let outage = if self.rejected() > last.rejected {
                 Outage::UnusableScans
             } else {
                 Outage::NoScans
             };
             let before = self.monitor.reason();
-            (self.monitor).wait(silence, waited, period, moved.as_ref());
+            (self.monitor).wait(outage, waited, period, moved.as_ref());
             let duration_s = time_s - last.time_s;
             carried = moved.and_then(|moved| self.carried(moved, duration_s));
             self.note_change(before, time_s);
