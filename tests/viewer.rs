@@ -82,8 +82,8 @@ impl StallingViewer {
         (head[0] == 0x81, read(length))
     }
 
-    /// Subscribes to all topics: the first that a viewer is told of are all of them, whenever it connects. The server would not
-    /// know the channel of one that it has just told.
+    /// Subscribes to all topics, which the first announcement names, whenever the viewer connects: subscriptions to a channel that
+    /// is announced later might be refused.
     fn subscribe(&mut self) {
         while self.topics.is_empty() {
             let (true, text) = self.receive() else {

@@ -60,7 +60,8 @@ impl Viewer {
     /// Serves topics at an address; with port 0, at any free port.
     pub fn listen(address: SocketAddr, topics: &[Topic]) -> Result<Self> {
         let (context, latched) = (Context::new(), Arc::<Latched>::default());
-        // Before the first viewer: one that is told of a channel that is made later may subscribe to it sooner than the server knows.
+        // All channels exist before the first viewer connects: the server announces a later one to viewers before it accepts
+        // their subscriptions to it.
         let channels = topics.iter().map(|topic| {
             let builder = (context.channel_builder(topic.name))
                 .message_encoding(&topic.encoding)
