@@ -61,6 +61,10 @@ def bench(name, *arguments, **environment):
     return run("cargo", "bench", "--bench", name, "--", *arguments, **environment)
 
 
+def settings(*values):
+    return [word for value in values for word in ("--set", value)]
+
+
 def row(*cells):
     print("|", " | ".join(str(cell) for cell in cells), "|")
 
@@ -114,17 +118,16 @@ def map_of(recording, file, *arguments):
 
 
 def map_0005(work):
-    steps = ["--set", "frame_step=2", "--set", "depth=10"]
-    return map_of(require(DRIVE_0005), work / "drive_0005/map.ply", *steps)
+    return map_of(require(DRIVE_0005), work / "drive_0005/map.ply", *settings("frame_step=2", "depth=10"))
 
 
 def drive_0005(work, seeds):
-    odd = [DRIVE_0005, "--map", map_0005(work), "--set", "start_idx=1", "--set", "frame_step=2", *TRUTH_0005]
+    odd = [DRIVE_0005, "--map", map_0005(work), *settings("start_idx=1", "frame_step=2"), *TRUTH_0005]
     stereo = ["--odometry", DRIVE_0005 / "odometry_stereo.txt"]
     table("odometry", "position RMSE", "heading RMSE", "time per frame")
     localized(work / "drive_0005", seeds, "scans", odd, [])
     localized(work / "drive_0005", seeds, "stereo camera", odd + stereo, [])
-    localized(work / "drive_0005", seeds, "noisy truth", odd + ["--set", "odometry=ground_truth"], [])
+    localized(work / "drive_0005", seeds, "noisy truth", odd + settings("odometry=ground_truth"), [])
 
 
 def kitti_07_drives(work):
@@ -135,14 +138,13 @@ def kitti_07_drives(work):
     parent = work / "kitti_07"
     for drive in (1, 2):
         if not (parent / f"drive_{drive}").exists():
-            settings = [
+            chosen = settings(
                 f"drive={drive}",
                 f"output_folder={parent}",
                 f"path_pose_file={poses}",
                 f"path_calib_file={calib}",
                 "scanner.rolling_shutter=true",
-            ]
-            chosen = [word for setting in settings for word in ("--set", setting)]
+            )
             fpmcl("simulate", "config/kitti_07/simulation.yml", *chosen)
     return work / "kitti_07/drive_1", work / "kitti_07/drive_2"
 
@@ -195,8 +197,8 @@ def kitti_raw_drive(work):
     folder = work / "kitti_raw"
     day = folder / "2011_09_26"
     if not day.exists():
-        settings = [f"output_folder={folder}", "n_scans=300", "scanner.rolling_shutter=true"]
-        fpmcl("simulate", "--force", *[word for setting in settings for word in ("--set", setting)])
+        chosen = settings(f"output_folder={folder}", "n_scans=300", "scanner.rolling_shutter=true")
+        fpmcl("simulate", "--force", *chosen)
         run(sys.executable, "benches/kitti_raw.py", folder / "drive_1", folder)
     return day / "2011_09_26_drive_0001_sync"
 
@@ -250,7 +252,7 @@ def benchmark(work, _seeds):
 
 def ground(work, _seeds):
     for name in ("semantickitti-00-labels", "semantickitti-08-labels", "nuscenes-hdl32"):
-        output = ["--set", f"output_folder={work / 'ground' / name}", "--set", "plot_step=0"]
+        output = settings(f"output_folder={work / 'ground' / name}", "plot_step=0")
         block(fpmcl("ground", require(DATA / name), *output))
         scans = DATA / name / "velodyne"
         if importlib.util.find_spec("pypatchworkpp") and scans.exists():
@@ -296,13 +298,8 @@ KEYS = {
 }
 
 
-
 def keys(*blocks):
     return [f"{block}.{key}" for block in blocks for key in KEYS[block]]
-
-
-def settings(*values):
-    return [word for value in values for word in ("--set", value)]
 
 
 def default_of(command, key):
