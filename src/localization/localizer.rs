@@ -10,7 +10,7 @@ use super::preparation::ScanPreparation;
 use super::sweep::SweepMotion;
 use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::lidar::{Motion, RangeImage, Scan};
+use crate::lidar::{RangeImage, Scan};
 use crate::map::{Map, PanoramaRequest, SearchRegion, SensorAttitude};
 use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
@@ -165,7 +165,9 @@ impl Localizer {
             Odometry::Motion(motion) => before.map(|_| self.attitude.after(&motion)),
             _ => before,
         };
-        let motion = self.motion_during(scan, odometry, known, duration_s, &mut rng)?;
+        let near = self.registered(scan, odometry, known, duration_s, &mut rng)?;
+        let motion = near.and_then(|pose| self.sweep.around(&pose, duration_s));
+        let motion = motion.or(self.sweep.predict(odometry, duration_s));
         let image = self.preparation.range_image(scan, motion.as_ref());
         if let Some(attitude) = known.or_else(|| self.preparation.attitude(&image)) {
             self.attitude = attitude;
@@ -179,6 +181,7 @@ impl Localizer {
         };
         let filter = self.filter.insert(filter);
         filter.set_duration_s(duration_s);
+        filter.set_near(near);
         let mut estimate = filter.step(odometry, &image, &self.attitude, &mut rng)?;
         if let Some(found) = filter.attitude().filter(|found| Some(*found) != before) {
             self.attitude = found;
@@ -190,30 +193,26 @@ impl Localizer {
         Ok(estimate)
     }
 
-    /// Motion of the sensor during a sweep: while tracking, from a registration of some of its points; otherwise the
-    /// predicted one. `None` if it is unknown.
-    fn motion_during(
+    /// Pose of a scan whose points have times, by a registration of some of them with the predicted motion during the sweep;
+    /// `None` while the filter is not tracking.
+    fn registered(
         &self,
         scan: &Scan,
         odometry: Odometry,
         attitude: Option<SensorAttitude>,
         duration_s: f64,
         rng: &mut Generator,
-    ) -> Result<Option<Motion>, LocalizerError> {
+    ) -> Result<Option<Pose3>, LocalizerError> {
         /// Every n-th point is registered; beams are not numbered in multiples of it.
         const STEP: usize = 3;
+        let filter = self.filter.as_ref().filter(|_| !scan.times_s.is_empty());
+        let Some((filter, attitude)) = filter.zip(attitude) else {
+            return Ok(None);
+        };
         let predicted = self.sweep.predict(odometry, duration_s);
-        let Some(filter) = self.filter.as_ref().filter(|_| !scan.times_s.is_empty()) else {
-            return Ok(predicted);
-        };
-        let Some(attitude) = attitude else {
-            return Ok(predicted);
-        };
         let some = scan.every(STEP);
         let image = self.preparation.range_image(&some, predicted.as_ref());
-        let pose = filter.registered(odometry, &image, &attitude, rng)?;
-        let found = pose.and_then(|pose| self.sweep.around(&pose, duration_s));
-        Ok(found.or(predicted))
+        Ok(filter.registered(odometry, &image, &attitude, rng)?)
     }
 
     /// The filter with its initial particles.

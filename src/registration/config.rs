@@ -49,6 +49,14 @@ impl RegistrationConfig {
         Matrix3::from_diagonal(&deviations.component_mul(&deviations))
     }
 
+    /// The settings for a pose that is needed within a distance only [m].
+    pub(crate) fn within(&self, distance_m: f64) -> Self {
+        Self {
+            tolerance_m: self.tolerance_m.max(distance_m),
+            ..self.clone()
+        }
+    }
+
     /// The settings for a pose that is not certain, with twice the noise of the normals: where they are noisier than usual,
     /// as on parts of a tunnel or of a motorway, they would confirm a wrong place.
     pub(crate) fn cautious(&self) -> Self {

@@ -42,6 +42,9 @@ use crate::geometry::{Pose3, Rigid3f, RobustKernel, azimuth_sector};
 use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
 
+/// Last step of a registration after which another one follows [m].
+const NEAR_M: f64 = 0.01;
+
 /// A registered pose with its covariance.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct RegistrationResult {
@@ -77,12 +80,21 @@ pub(crate) fn register(
     initial: &Pose3,
     config: &RegistrationConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
+    let residuals = linearize(renderer, beams, initial, config)?;
+    descend(renderer, beams, (*initial, residuals), config)
+}
+
+/// Registers beams, starting at a pose with its residuals.
+fn descend(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    (mut pose, mut residuals): (Pose3, Vec<Residual>),
+    config: &RegistrationConfig,
+) -> Result<Option<RegistrationResult>, RenderError> {
     /// Lever of rotations [m].
     const LEVER_M: f64 = 10.0;
-    let mut pose = *initial;
     let mut iterations = 0;
     loop {
-        let residuals = linearize(renderer, beams, &pose, config)?;
         let Some(equations) = Equations::new(&residuals, config) else {
             return Ok(None);
         };
@@ -100,6 +112,7 @@ pub(crate) fn register(
                 iterations,
             }));
         }
+        residuals = linearize(renderer, beams, &pose, config)?;
     }
 }
 
@@ -136,18 +149,15 @@ pub(crate) fn register_informative(
     if beams.len() <= COARSE {
         return register(renderer, beams, initial, config);
     }
-    let coarse = RegistrationConfig {
-        tolerance_m: 10.0 * config.tolerance_m,
-        ..config.clone()
-    };
     let step = beams.len().div_ceil(COARSE);
     let some: Vec<Beam> = beams.iter().step_by(step).copied().collect();
-    let near = register(renderer, &some, initial, &coarse)?;
+    let near = register(renderer, &some, initial, &config.within(NEAR_M))?;
     let near = near.map_or(*initial, |near| near.map_from_lidar);
-    let residuals = linearize(renderer, beams, &near, config)?;
+    let mut residuals = linearize(renderer, beams, &near, config)?;
     let chosen = informative::choose(&residuals, FINE, config);
+    residuals.retain(|residual| chosen.binary_search(&residual.beam).is_ok());
     let chosen: Vec<Beam> = chosen.iter().map(|&beam| beams[beam]).collect();
-    register(renderer, &chosen, &near, config)
+    descend(renderer, &chosen, (near, residuals), config)
 }
 
 /// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second
@@ -162,8 +172,7 @@ pub(crate) fn register_coarse_to_fine(
 ) -> Result<Option<RegistrationResult>, RenderError> {
     let wide = RegistrationConfig {
         kernel_m: config.kernel_m.max(wide_kernel_m),
-        tolerance_m: 0.01,
-        ..config.clone()
+        ..config.within(NEAR_M)
     };
     let (mut pose, mut result) = (*initial, None);
     for (beams, config) in beams.into_iter().zip([&wide, config]) {

@@ -41,6 +41,8 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Option<Pose3>, RenderError> {
+        /// Last step [m], which is a millimetre of the motion during a sweep.
+        const WITHIN_M: f64 = 1e-3;
         let config = &self.config.proposal;
         let pending = self.pending.unwrap_or_default().motion;
         let predicted = self.particles.mean() * pending * self.increment(odometry);
@@ -51,7 +53,8 @@ impl ParticleFilter {
         let count = config.compared_beams;
         let beams = choose_beams(scan, count, config.road_share, attitude, rng);
         let start = patch.lift(&predicted, attitude);
-        let found = register(&*self.map.renderer, &beams, &start, &config.registration)?;
+        let registration = config.registration.within(WITHIN_M);
+        let found = register(&*self.map.renderer, &beams, &start, &registration)?;
         Ok(found.map(|found| found.map_from_lidar))
     }
 
@@ -73,7 +76,7 @@ impl ParticleFilter {
         };
         let mut choose = |count| choose_beams(scan, count, config.road_share, attitude, rng);
         let (registered, beams) = (choose(config.beams), choose(config.compared_beams));
-        let start = patch.lift(&mean, attitude);
+        let start = (self.near).unwrap_or_else(|| patch.lift(&mean, attitude));
         let registration = match self.phase {
             Phase::Tracking => &config.registration,
             _ => &config.registration.cautious(),

@@ -5,7 +5,7 @@ use std::time::Duration;
 use nalgebra::{Matrix3, Vector3};
 
 use super::phase::Phase;
-use crate::geometry::Pose2;
+use crate::geometry::{Pose2, Pose3};
 use crate::lidar::PERIOD_S;
 use crate::localization::config::LocalizerConfig;
 use crate::localization::convergence::is_narrow;
@@ -33,6 +33,8 @@ pub struct ParticleFilter {
     pub(super) last_motion: Option<LastMotion>,
     /// Time since the previous frame [s].
     pub(super) duration_s: f64,
+    /// Where the registration of the next scan starts; `None` at the prediction.
+    pub(super) near: Option<Pose3>,
     /// Last known ground below the estimate.
     pub(super) patch: Option<GroundPatch>,
     /// Attitude of the sensor in the last update.
@@ -101,6 +103,7 @@ impl ParticleFilter {
             pending: None,
             last_motion: None,
             duration_s: PERIOD_S,
+            near: None,
             attitude: None,
         })
     }
@@ -108,6 +111,11 @@ impl ParticleFilter {
     /// Sets the time between the previous frame and the next [s].
     pub fn set_duration_s(&mut self, duration_s: f64) {
         self.duration_s = duration_s;
+    }
+
+    /// Sets a pose of the next scan, from [`registered`](Self::registered), near which its registration starts.
+    pub fn set_near(&mut self, near: Option<Pose3>) {
+        self.near = near;
     }
 
     /// Attitude of the sensor in the last frame if it is a good start for the next: while tracking it
