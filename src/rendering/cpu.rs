@@ -343,21 +343,28 @@ impl RangeRenderer for CpuRenderer {
         let to_cast = CastBeams::new(beams, |beam| reach_near_end(beam, within_m));
         let grouping = Grouping::of(&[*map_from_lidar], &to_cast);
         let scene = self.scenes.scene(&[origin_of(map_from_lidar)]);
-        let pieces: Vec<Vec<Hit>> = to_cast
-            .order
-            .par_chunks(RAYS_PER_PIECE)
-            .map(|rays| hits(&scene, map_from_lidar, rays, &to_cast, grouping))
-            .collect::<Result<_, TileError>>()?;
         let rotation = rotation_of(map_from_lidar);
-        let mut surfaces = vec![None; beams.len()];
-        for (&ray, hit) in to_cast.order.iter().zip(pieces.into_iter().flatten()) {
+        let surface = |(&ray, hit): (&u32, &Hit)| {
             let beam = &beams[ray as usize];
-            if is_near_end(beam, hit.range_m, within_m) {
-                surfaces[ray as usize] = scene.normal(&hit)?.map(|normal| SurfaceHit {
-                    range_m: hit.range_m,
-                    normal_in_map: facing(normal, rotation * beam.direction),
-                });
+            if !is_near_end(beam, hit.range_m, within_m) {
+                return Ok(None);
             }
+            let found = scene.normal(hit)?.map(|normal| SurfaceHit {
+                range_m: hit.range_m,
+                normal_in_map: facing(normal, rotation * beam.direction),
+            });
+            Ok(found)
+        };
+        let pieces: Vec<Vec<Option<SurfaceHit>>> = (to_cast.order)
+            .par_chunks(RAYS_PER_PIECE)
+            .map(|rays| {
+                let hits = hits(&scene, map_from_lidar, rays, &to_cast, grouping)?;
+                rays.iter().zip(&hits).map(surface).collect()
+            })
+            .collect::<Result<_, TileError>>()?;
+        let mut surfaces = vec![None; beams.len()];
+        for (&ray, found) in to_cast.order.iter().zip(pieces.into_iter().flatten()) {
+            surfaces[ray as usize] = found;
         }
         Ok(surfaces)
     }
