@@ -197,15 +197,8 @@ impl Observation<'_> {
         } else {
             let information = at.lidar_from_odom * information * at.rotation;
             let pull = information * (at.lidar_from_odom * offset);
-            let jacobian = DVec3::AXES.map(|axis| factors.jacobian(axis, in_lidar));
             let sums = &mut equations.other;
-            for row in 0..3 {
-                sums.right_side -= weight * pull[row] * jacobian[row];
-                for column in 0..3 {
-                    let value = weight * information.col(column)[row];
-                    (sums.information).ger(value, &jacobian[row], &jacobian[column], 1.0);
-                }
-            }
+            sums.add_in_space(&factors, in_lidar, (information, pull), weight);
             sums.count(distance_m, weight);
         }
     }
@@ -229,8 +222,45 @@ impl Factors {
 
 impl Sums {
     fn add(&mut self, jacobian: &Vector6<f64>, residual_m: f64, weight: f64) {
-        self.information.ger(weight, jacobian, jacobian, 1.0);
+        for column in 0..6 {
+            let factor = weight * jacobian[column];
+            for row in 0..6 {
+                self.information[(row, column)] += factor * jacobian[row];
+            }
+        }
         self.right_side -= weight * residual_m * jacobian;
+    }
+
+    /// Adds the residual of a point in space, with its information matrix Ω and what that makes of the residual:
+    /// Jᵀ Ω J with J = (m I, t B), where row k of B is q × eₖ.
+    fn add_in_space(
+        &mut self,
+        factors: &Factors,
+        point: DVec3,
+        (information, pull): (DMat3, DVec3),
+        weight: f64,
+    ) {
+        let transposed = DMat3::from_cols(
+            point.cross(DVec3::X),
+            point.cross(DVec3::Y),
+            point.cross(DVec3::Z),
+        );
+        let Factors { moved, turned } = *factors;
+        let beside = information * transposed.transpose();
+        let of_shift = information * (weight * moved * moved);
+        let mixed = beside * (weight * moved * turned);
+        let of_turn = transposed * beside * (weight * turned * turned);
+        let sum = &mut self.information;
+        for column in 0..3 {
+            for row in 0..3 {
+                sum[(row, column)] += of_shift.col(column)[row];
+                sum[(row, column + 3)] += mixed.col(column)[row];
+                sum[(column + 3, row)] += mixed.col(column)[row];
+                sum[(row + 3, column + 3)] += of_turn.col(column)[row];
+            }
+        }
+        let (shift, turn) = (weight * moved * pull, weight * turned * (transposed * pull));
+        self.right_side -= Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z);
     }
 
     fn count(&mut self, distance_m: f64, weight: f64) {
@@ -342,6 +372,32 @@ mod tests {
         let equations = observation.linearize(&pose, 0.1, &mut observation.unmatched());
         let (cost, count) = equations.cost();
         (cost / count as f64, equations.common_share())
+    }
+
+    #[test]
+    fn a_residual_in_space_is_the_sum_of_those_along_its_principal_axes() {
+        let factors = Factors {
+            moved: 1.3,
+            turned: 0.8,
+        };
+        let (point, offset) = (DVec3::new(7.0, -4.0, 1.5), DVec3::new(0.02, 0.05, -0.03));
+        let axes = DMat3::from_quat(DQuat::from_rotation_z(0.6) * DQuat::from_rotation_x(-0.9));
+        let variances = DVec3::new(0.9, 0.3, 0.01);
+        let information = axes * DMat3::from_diagonal(variances) * axes.transpose();
+        let (mut in_space, mut along_axes) = (Sums::default(), Sums::default());
+        in_space.add_in_space(&factors, point, (information, information * offset), 0.7);
+        for axis in 0..3 {
+            let normal = axes.col(axis);
+            let jacobian = factors.jacobian(normal, point);
+            along_axes.add(&jacobian, normal.dot(offset), 0.7 * variances[axis]);
+        }
+        let within = |a: f64, b: f64| (a - b).abs() < 1e-9;
+        assert!(
+            (in_space.information.iter().zip(&along_axes.information)).all(|(a, b)| within(*a, *b))
+        );
+        assert!(
+            (in_space.right_side.iter().zip(&along_axes.right_side)).all(|(a, b)| within(*a, *b))
+        );
     }
 
     #[test]
