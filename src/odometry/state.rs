@@ -423,7 +423,7 @@ impl OdometerState {
             .insert(&sample.mapped(&self.odom_from_lidar, Some(&motion)));
         let center = self.odom_from_lidar.translation.vector.into();
         self.map
-            .remove_beyond(center, config.map_radius_share * self.range_m);
+            .move_sensor(center, config.map_radius_share * self.range_m);
     }
 
     /// Moves by the prediction. After several scans in turn that do not fit, the local map restarts with this one.

@@ -39,6 +39,8 @@ struct Moments {
     squares: Vec3,
     /// yz, zx, xy
     products: Vec3,
+    /// Path of the sensor when the last point was added [m].
+    added_at_m: f32,
 }
 
 impl Moments {
@@ -69,11 +71,30 @@ impl Moments {
     }
 }
 
-/// Voxels of one scale.
+/// Voxels of one scale, eight in a brick, so that those around a point need few searches.
 #[derive(Clone, Debug)]
 struct VoxelGrid {
     edge_m: f64,
-    cells: HashMap<u64, Moments>,
+    bricks: HashMap<u64, Brick>,
+}
+
+/// Moments of the voxels of a brick; those of an empty one are zero.
+type Brick = [Moments; 8];
+
+/// The brick of a voxel, and its place in it.
+fn place_of(cell: IVec3) -> (IVec3, usize) {
+    (cell >> 1, place_at(cell & 1))
+}
+
+/// Place in a brick of the voxel at an offset of 0 or 1 voxels from its corner, per axis.
+fn place_at(offset: IVec3) -> usize {
+    (offset.x | offset.y << 1 | offset.z << 2) as usize
+}
+
+/// Offset of a voxel from the corner of its brick [voxels].
+fn offset_of(place: usize) -> IVec3 {
+    let place = place as i32;
+    IVec3::new(place & 1, (place >> 1) & 1, place >> 2)
 }
 
 /// The surface near a point.
@@ -99,6 +120,11 @@ pub enum Shape {
 pub struct VoxelMap {
     levels: [VoxelGrid; 3],
     point_limit: f32,
+    /// Where the sensor was last, and the length of its path until there [m].
+    sensor: Option<DVec3>,
+    path_m: f64,
+    /// That length at which voxels were removed last [m].
+    removed_at_m: Option<f64>,
 }
 
 impl VoxelMap {
@@ -106,23 +132,28 @@ impl VoxelMap {
     pub fn new(edge_m: f64, point_limit: f32) -> Self {
         let level = |scale: f64| VoxelGrid {
             edge_m: edge_m * scale,
-            cells: HashMap::default(),
+            bricks: HashMap::default(),
         };
         Self {
             levels: [level(1.0), level(2.0), level(4.0)],
             point_limit,
+            sensor: None,
+            path_m: 0.0,
+            removed_at_m: None,
         }
     }
 
     /// Adds points.
     pub fn insert(&mut self, points: &[DVec3]) {
-        let point_limit = self.point_limit;
+        let (point_limit, path_m) = (self.point_limit, self.path_m as f32);
         self.levels.par_iter_mut().for_each(|level| {
             for &point in points {
                 let cell = cell_of(point / level.edge_m);
                 let offset = (point - cell.as_dvec3() * level.edge_m).as_vec3();
-                let moments = level.cells.entry(pack(cell)).or_default();
+                let (brick, place) = place_of(cell);
+                let moments = &mut level.bricks.entry(pack(brick)).or_default()[place];
                 moments.add(offset, point_limit);
+                moments.added_at_m = path_m;
             }
         });
     }
@@ -130,22 +161,47 @@ impl VoxelMap {
     /// The means of the finest voxels, in a fixed order.
     pub fn means(&self) -> Vec<DVec3> {
         let level = &self.levels[0];
-        let mut keys: Vec<u64> = level.cells.keys().copied().collect();
-        keys.sort_unstable();
-        let mean = |key: u64| {
-            let cell = &level.cells[&key];
-            unpack(key).as_dvec3() * level.edge_m + (cell.first / cell.count).as_dvec3()
-        };
-        keys.into_iter().map(mean).collect()
+        let mut means: Vec<(u64, DVec3)> = (level.bricks.iter())
+            .flat_map(|(&key, brick)| (brick.iter().enumerate()).map(move |it| (key, it)))
+            .filter(|(_, (_, moments))| moments.count > 0.0)
+            .map(|(key, (place, moments))| {
+                let cell = unpack(key) * 2 + offset_of(place);
+                let offset = (moments.first / moments.count).as_dvec3();
+                (pack(cell), cell.as_dvec3() * level.edge_m + offset)
+            })
+            .collect();
+        means.sort_unstable_by_key(|&(key, _)| key);
+        means.into_iter().map(|(_, mean)| mean).collect()
     }
 
-    /// Removes voxels whose mean is farther than `radius_m` from a point.
-    pub fn remove_beyond(&mut self, center: DVec3, radius_m: f64) {
+    /// Moves the sensor: removes voxels that are farther than `radius_m` from it, and those that got no point over a path of ten
+    /// times that length, which returns without the errors of what was seen before. Without that, the map of a car that stays in
+    /// one place would grow as long as it drives.
+    pub fn move_sensor(&mut self, to: DVec3, radius_m: f64) {
+        const PATH_IN_RADII: f64 = 10.0;
+        /// Path after which voxels are looked at again, in radii.
+        const STEP: f64 = 0.02;
+        self.path_m += self.sensor.replace(to).map_or(0.0, |it| it.distance(to));
+        if (self.removed_at_m).is_some_and(|at_m| self.path_m - at_m < STEP * radius_m) {
+            return;
+        }
+        self.removed_at_m = Some(self.path_m);
+        let oldest_m = (self.path_m - PATH_IN_RADII * radius_m) as f32;
         self.levels.par_iter_mut().for_each(|level| {
             let edge_m = level.edge_m;
-            level.cells.retain(|&key, _| {
-                let corner = unpack(key).as_dvec3() * edge_m;
-                corner.distance_squared(center) <= radius_m * radius_m
+            level.bricks.retain(|&key, brick| {
+                let corner = unpack(key) * 2;
+                let mut is_empty = true;
+                for (place, moments) in brick.iter_mut().enumerate() {
+                    let at = (corner + offset_of(place)).as_dvec3() * edge_m;
+                    if at.distance_squared(to) > radius_m * radius_m
+                        || moments.added_at_m < oldest_m
+                    {
+                        *moments = Moments::default();
+                    }
+                    is_empty &= moments.count == 0.0;
+                }
+                !is_empty
             });
         });
     }
@@ -192,11 +248,22 @@ impl VoxelGrid {
         let block = self.block(point);
         let edge_m = self.edge_m as f32;
         let mut sums = Moments::default();
+        let mut bricks: [Option<&Brick>; 8] = [None; 8];
+        // Along an axis the block is in two bricks where it begins in the second half of one.
+        let is_split = place_at(block & 1);
+        for split in (0..8).filter(|split| split & !is_split == 0) {
+            let brick = (block >> 1) + offset_of(split);
+            bricks[split] = self.bricks.get(&pack(brick));
+        }
         for corner in 0..8 {
-            let step = IVec3::new(corner & 1, (corner >> 1) & 1, corner >> 2);
-            if let Some(cell) = self.cells.get(&pack(block + step)) {
+            let step = offset_of(corner);
+            let Some(brick) = bricks[corner & is_split] else {
+                continue;
+            };
+            let moments = &brick[place_of(block + step).1];
+            if moments.count > 0.0 {
                 // Relative to the middle of the block.
-                sums.merge(cell, (step - IVec3::ONE).as_vec3() * edge_m);
+                sums.merge(moments, (step - IVec3::ONE).as_vec3() * edge_m);
             }
         }
         if sums.count < MIN_POINTS {
@@ -298,9 +365,24 @@ mod tests {
         let (points, _) = tilted_plane();
         let mut map = VoxelMap::new(0.5, 50.0);
         map.insert(&points);
-        map.remove_beyond(points[0], 1.0);
+        map.move_sensor(points[0], 1.0);
         assert!(map.surface(points[0]).is_some() && map.surface(points[1599]).is_none());
-        map.remove_beyond(DVec3::ZERO, 1.0);
+        map.move_sensor(DVec3::ZERO, 1.0);
         assert!(map.means().is_empty());
+    }
+
+    #[test]
+    fn voxels_that_no_point_reaches_over_a_long_path_are_removed() {
+        let mut map = VoxelMap::new(0.5, 50.0);
+        let at = |x: f64| DVec3::new(x, 0.0, 0.0);
+        map.insert(&[at(1.0), at(2.0)]);
+        // To and fro over 2 m, with a radius of 5 m: 50 m of path.
+        for pass in 0..26 {
+            assert_eq!(map.means().len(), 2, "{pass}");
+            map.move_sensor(at(2.0 * f64::from(pass % 2)), 5.0);
+            map.insert(&[at(2.0)]);
+        }
+        map.move_sensor(at(0.0), 5.0);
+        assert_eq!(map.means(), [at(2.0)]);
     }
 }
