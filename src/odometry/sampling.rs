@@ -107,8 +107,13 @@ impl Sample {
 pub fn first_per_voxel(points: impl Iterator<Item = TimedPoint>, voxel_m: f64) -> Vec<TimedPoint> {
     let per_m = (1.0 / voxel_m) as f32;
     let mut occupied = HashSet::<u64>::default();
+    let mut last = None;
     points
-        .filter(|point| occupied.insert(pack(cell_of((point.position * per_m).as_dvec3()))))
+        .filter(|point| {
+            let voxel = pack(cell_of((point.position * per_m).as_dvec3()));
+            // Successive points are often in one voxel, which needs no search.
+            last.replace(voxel) != Some(voxel) && occupied.insert(voxel)
+        })
         .collect()
 }
 
