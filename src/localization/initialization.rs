@@ -191,6 +191,32 @@ mod tests {
     }
 
     #[test]
+    fn positions_in_a_cell_are_uniform() {
+        let mut rng = StdRng::seed_from_u64(3);
+        let count = 20_000;
+        let offsets: Vec<Vector2<f64>> = (0..count)
+            .map(|_| uniform_in_cell(Point2::new(4.0, -7.0), 3.0, &mut rng))
+            .map(|position| position - Vector2::new(4.0, -7.0))
+            .collect();
+        let n = f64::from(count);
+        let mean = offsets.iter().sum::<Vector2<f64>>() / n;
+        for axis in 0..2 {
+            assert!(offsets.iter().all(|offset| offset[axis].abs() <= 1.5));
+            // Of a uniform distribution from -1.5 to 1.5 m: four standard errors.
+            let squares = offsets.iter().map(|offset| offset[axis].powi(2));
+            assert_relative_eq!(mean[axis], 0.0, epsilon = 4.0 * (0.75 / n).sqrt());
+            let error = 1.5_f64.powi(2) * (1.0_f64 / 5.0 - 1.0 / 9.0).sqrt() / n.sqrt();
+            assert_relative_eq!(squares.sum::<f64>() / n, 0.75, epsilon = 4.0 * error);
+        }
+        let products = offsets.iter().map(|offset| offset.x * offset.y);
+        assert_relative_eq!(
+            products.sum::<f64>() / n,
+            0.0,
+            epsilon = 4.0 * 0.75 / n.sqrt()
+        );
+    }
+
+    #[test]
     fn panorama_samples_lie_around_the_truth() {
         let world = TestWorld::street();
         let truth = world.pose_at(33.0, 0.4, 0.2);

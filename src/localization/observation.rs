@@ -372,6 +372,42 @@ mod tests {
     }
 
     #[test]
+    fn near_points_are_every_seventh_pixel_with_a_return_within_twenty_metres() {
+        let world = TestWorld::street();
+        let image = world.scan(&world.pose_at(0.0, 0.0, 0.0));
+        let near = near_points(&image);
+        let every_seventh = || (0..image.ranges.len()).step_by(7);
+        let expected: Vec<Vec3> = every_seventh()
+            .filter(|&pixel| image.points[pixel].length() < 20.0 && image.has_return(pixel))
+            .map(|pixel| image.points[pixel])
+            .collect();
+        assert_eq!(near, expected);
+        let returns = every_seventh().filter(|&pixel| image.has_return(pixel));
+        assert!(near.len() > 200 && near.len() < returns.count());
+    }
+
+    #[test]
+    fn ranges_along_beams_reach_behind_the_farthest_of_them() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(0.0, 0.0, 0.0);
+        let lifted = world.ground.lift(&truth, &SensorAttitude::default());
+        let lifted = lifted.unwrap().unwrap();
+        // Beams that end 0.25 m in front of the surfaces agree with them.
+        let measured: Vec<Beam> = world.scan(&truth).beams().collect();
+        let short = |beam: &Beam| Beam {
+            range_m: beam.range_m - 0.25,
+            ..*beam
+        };
+        let beams: Vec<Beam> = measured.iter().map(short).collect();
+        let found = ranges_along(&world, &lifted, &beams, 0.3).unwrap();
+        assert_eq!(found.len(), beams.len());
+        for (beam, range_m) in measured.iter().zip(&found) {
+            assert_relative_eq!(beam.range_m, *range_m, epsilon = 1e-3);
+        }
+        assert_eq!(agreement(&beams, &found, 0.3), Some(1.0));
+    }
+
+    #[test]
     fn a_scan_with_few_returns_yields_all_of_them() {
         let model = LidarModel::default();
         let image = RangeImage::project(&[Vec3::new(8.0, 1.0, 0.0)], &model);

@@ -198,6 +198,16 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_number_of_a_result_is_that_of_its_state() {
+        for state in [State::Searching, State::Tracking, State::Lost] {
+            assert_eq!(State::from_number(state as u8), Some(state));
+        }
+        assert_eq!(State::from_number(3), None);
+        let words = [State::Searching, State::Tracking, State::Lost].map(State::word);
+        assert_eq!(words, ["searching", "tracking", "lost"]);
+    }
+
+    #[test]
     fn a_share_far_below_the_usual_one_is_noticed_and_a_first_one_is_not() {
         let config = TrackingLossConfig::default();
         let mut monitor = AgreementMonitor::default();

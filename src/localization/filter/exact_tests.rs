@@ -12,7 +12,7 @@ use super::state::{Pending, Updated};
 use crate::geometry::Pose2;
 use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::motion::OdometryNoise;
-use crate::localization::particles::deviation;
+use crate::localization::particles::{Particle, deviation};
 use crate::localization::proposal::Gaussian;
 use crate::localization::{LocalizerConfig, Odometry, ParticleSet, State};
 use crate::map::gaussian_for_tests::GaussianWorld;
@@ -91,6 +91,149 @@ fn the_estimate_of_an_update_and_its_covariance_are_those_of_the_posterior() {
             );
         }
     }
+}
+
+#[test]
+fn the_attitude_is_that_of_the_mapped_ground_where_the_pose_is_known_and_else_that_of_the_scan() {
+    let street = TestWorld::street();
+    let mut config = LocalizerConfig::of_test(6);
+    config.proposal.scan = false;
+    // The weights of particles that are far from each other hardly change.
+    config.tempering.min_effective_fraction = 0.999;
+    let start = street.pose_at(0.0, 0.0, 0.0);
+    let ahead = Pose2::translation(0.5, 0.0);
+    let scan = street.scan(&(start * ahead));
+    let (exact, off) = (
+        SensorAttitude::default(),
+        SensorAttitude {
+            roll_rad: 0.01,
+            pitch_rad: -0.008,
+            ..SensorAttitude::default()
+        },
+    );
+    let attitude = |apart_m: f64| {
+        let places = [-1.0, 1.0].map(|side| start * Pose2::translation(0.0, 0.5 * side * apart_m));
+        let particles = ParticleSet::uniform(places.into_iter().cycle().take(6));
+        let mut filter = tracking(config.clone(), start, Matrix3::zeros());
+        filter.particles = particles;
+        let mut rng = StdRng::seed_from_u64(1);
+        let frame = filter.step(Odometry::Increment(ahead), &scan, &off, &mut rng);
+        let frame = frame.unwrap();
+        assert_eq!((frame.updated, frame.places), (true, 1));
+        frame.attitude
+    };
+    let narrow = attitude(0.01);
+    assert_relative_eq!(narrow.roll_rad, exact.roll_rad, epsilon = 2e-3);
+    assert_relative_eq!(narrow.pitch_rad, exact.pitch_rad, epsilon = 2e-3);
+    assert_relative_eq!(narrow.height_m, exact.height_m, epsilon = 0.01);
+    assert_eq!(attitude(4.0), off);
+}
+
+#[test]
+fn a_creeping_car_moves_by_its_odometry_and_during_a_search_from_the_likeliest_place() {
+    let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
+    let creep = Pose2::new(Vector2::new(0.08, 0.01), 0.005);
+    let check = |places: [Pose2; 3], phase: Phase, expected: Pose2| {
+        let mut filter = tracking(LocalizerConfig::of_test(3), start, Matrix3::zeros());
+        filter.particles = ParticleSet::uniform(places);
+        filter.phase = phase;
+        let mut rng = StdRng::seed_from_u64(1);
+        let (creep_of_car, attitude) = (Odometry::Increment(creep), SensorAttitude::default());
+        let frame = filter.step(creep_of_car, &empty_scan(), &attitude, &mut rng);
+        let frame = frame.unwrap();
+        assert!(!frame.updated);
+        assert_relative_eq!(frame.pose, expected, epsilon = 1e-9);
+        for (after, before) in frame.particles.poses().zip(places) {
+            assert_relative_eq!(*after, before * creep, epsilon = 1e-9);
+        }
+    };
+    let particle = start * Pose2::translation(0.02, 0.03);
+    check([particle; 3], Phase::Tracking, particle * creep);
+    let apart = [-30.0, 0.0, 30.0].map(|x| start * Pose2::translation(x, 0.0));
+    let search = Search::Anywhere;
+    check(
+        apart,
+        Phase::Searching { search, updates: 1 },
+        start * creep,
+    );
+}
+
+#[test]
+fn places_weigh_by_the_particles_in_them_and_by_the_costs_of_their_scans() {
+    let street = TestWorld::street();
+    let [a, b] = [0.0, 30.0].map(|x| street.pose_at(x, 0.0, 0.0));
+    // The scan costs nothing at the first place and at the other one so much that it is exp(0.7) times less likely.
+    let mut config = LocalizerConfig::of_test(100);
+    let cost_m = config.places.tolerance_m + 0.7 * config.places.scale_m;
+    config.places.likely_weight = 0.1;
+    let scale_m = config.observation.scale_m;
+    let per_m2 = 2.0 * cost_m / (scale_m * 30.0_f64.powi(2));
+    let mut map = street.map();
+    map.renderer = Arc::new(GaussianWorld {
+        mean: a,
+        information: Matrix3::from_diagonal(&Vector3::new(per_m2, 0.0, 0.0)),
+        scale_m,
+    });
+    let start = ParticleSet::uniform([a, b]);
+    let mut filter = ParticleFilter::new(config, map, None, start).unwrap();
+    let mut rng = StdRng::seed_from_u64(1);
+    let attitude = SensorAttitude::default();
+    // Before the first scan, places weigh the same: their panoramas were compared with it.
+    for (before, likely) in [([0.3, 0.7], 2), ([0.9, 0.1], 1)] {
+        let is_first = filter.phase.search() == Some(Search::Anywhere);
+        let weighted = [(a, before[0]), (b, before[1])].map(|(pose, weight)| Particle {
+            weight,
+            ..Particle::new(pose, Some(-1.73))
+        });
+        filter.particles = ParticleSet::weighted(weighted.into());
+        let update = filter.search_places(&empty_scan(), &attitude, &mut rng);
+        let update = update.unwrap().unwrap();
+        let before = if is_first { [0.5, 0.5] } else { before };
+        let less_likely = before[1] * (-0.7_f64).exp();
+        let of_b = less_likely / (before[0] + less_likely);
+        assert_relative_eq!(update.pose.unwrap(), a, epsilon = 1e-9);
+        assert_relative_eq!(update.mean_cost_m.unwrap(), of_b * cost_m, epsilon = 1e-7);
+        assert_eq!(filter.phase.search(), Some(Search::Places { likely }));
+        // The particles of a place are at most 2.5 m off in each direction, as a standard deviation.
+        let particles = filter.particles.particles();
+        let (in_a, in_b): (Vec<&Particle>, Vec<&Particle>) =
+            (particles.iter()).partition(|it| it.map_from_lidar.translation.x < 15.0);
+        let counts = [in_a.len(), in_b.len()];
+        let share = |weight: f64| ((100.0 * weight) as usize).max(25);
+        assert_eq!(counts, [share(1.0 - of_b), share(of_b)]);
+        let weight = in_b.iter().map(|it| it.weight).sum::<f64>();
+        assert_relative_eq!(weight, of_b, epsilon = 1e-6);
+        let variance = in_a
+            .iter()
+            .map(|it| it.map_from_lidar.translation.y.powi(2));
+        let variance = variance.sum::<f64>() / counts[0] as f64;
+        assert_relative_eq!(variance, 6.25, epsilon = 0.3);
+    }
+}
+
+#[test]
+fn a_scan_is_registered_where_the_odometry_since_the_last_update_leads() {
+    let street = TestWorld::street();
+    let start = street.pose_at(0.0, 0.2, 0.05);
+    let [pending, step] = [2.0, 1.5].map(|x| Pose2::new(Vector2::new(x, 0.1), 0.02));
+    let truth = start * pending * step;
+    let scan = street.scan(&truth);
+    let registered = |phase: Phase| {
+        let mut filter = tracking(LocalizerConfig::of_test(3), start, Matrix3::zeros());
+        filter.pending = Some(Pending {
+            motion: pending,
+            ..Pending::default()
+        });
+        filter.phase = phase;
+        let mut rng = StdRng::seed_from_u64(1);
+        let (step, attitude) = (Odometry::Increment(step), SensorAttitude::default());
+        filter.registered(step, &scan, &attitude, &mut rng).unwrap()
+    };
+    let found = registered(Phase::Tracking).unwrap();
+    let expected = street.ground.lift(&truth, &SensorAttitude::default());
+    assert_relative_eq!(found, expected.unwrap().unwrap(), epsilon = 5e-3);
+    let search = Search::Around;
+    assert_eq!(registered(Phase::Lost { search }), None);
 }
 
 #[test]

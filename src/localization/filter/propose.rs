@@ -189,6 +189,26 @@ mod tests {
     }
 
     #[test]
+    fn of_three_particles_or_fewer_the_pose_is_their_mean() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let covariance = nalgebra::Matrix3::identity() * 1e-6;
+        let prior = Gaussian::new(truth, covariance).unwrap();
+        for (count, is_of_posterior) in [(3, false), (4, true), (100, true)] {
+            let mut rng = StdRng::seed_from_u64(1);
+            let mut filter = tracking(&world, &prior, &mut rng);
+            filter.config.num_reduced = count;
+            let attitude = SensorAttitude::default();
+            let posterior = filter.propose(&world.scan(&truth), &attitude, &mut rng);
+            let posterior = posterior.unwrap().unwrap();
+            let mean = posterior.gaussian.mean;
+            let update = filter.sample(posterior, &mut rng);
+            assert_eq!(update.pose, is_of_posterior.then_some(mean));
+            assert_eq!(filter.particles.len(), count);
+        }
+    }
+
+    #[test]
     fn the_covariance_of_an_estimate_contains_the_error_of_the_map_once() {
         let world = TestWorld::street();
         let truth = world.pose_at(12.0, 0.2, 0.05);
