@@ -498,6 +498,43 @@ mod tests {
     }
 
     #[test]
+    fn a_beam_votes_on_a_point_by_how_far_behind_it_it_ends() {
+        let model = model();
+        let projection = Projection::of(&model);
+        let mut scan = scan(&wall(), Vec3::ZERO);
+        // Half a metre and two percent of the range of the point, or a third of a metre on either side.
+        for (range_m, free_m, expected) in [
+            (10.0, 10.65, "unknown"),
+            (10.0, 10.75, "through"),
+            (30.0, 31.05, "unknown"),
+            (30.0, 31.15, "through"),
+            (30.0, 30.25, "seen"),
+            (30.0, 29.75, "seen"),
+            (30.0, 30.35, "unknown"),
+            (30.0, 29.65, "unknown"),
+            (30.0, 20.0, "unknown"),
+            (30.0, f32::INFINITY, "through"),
+            (model.max_range + 1.0, f32::INFINITY, "unknown"),
+        ] {
+            scan.free_range_m.fill(free_m);
+            let voter = Voter {
+                scan: &scan,
+                projection: &projection,
+                model: &model,
+                config: &VisibilityConfig::default(),
+            };
+            let vote = |sine: f32| match voter.vote(range_m, sine, 0.3) {
+                Vote::Through => "through",
+                Vote::Seen => "seen",
+                Vote::Unknown => "unknown",
+            };
+            assert_eq!(vote(0.1), expected, "{range_m} {free_m}");
+            // Above the field of view.
+            assert_eq!(vote(0.9), "unknown");
+        }
+    }
+
+    #[test]
     fn voting_scans_are_spread_over_all_scans() {
         assert_eq!(spread(100, 4), [12, 37, 62, 87]);
         assert_eq!(spread(3, 24), [0, 1, 2]);
