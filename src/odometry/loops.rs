@@ -374,6 +374,84 @@ mod tests {
         assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 10], 0.0)], 0.3), [false; 2]);
     }
 
+    /// A pole in each sector of 6 degrees of Scan Context, in rings of 1.5 m, on the ground.
+    fn poles(ring_of: impl Fn(usize) -> usize) -> Vec<TimedPoint> {
+        let pole = |sector: usize| {
+            let azimuth = (6.0 * (sector as f64 + 0.5)).to_radians();
+            let distance_m = 1.5 * (ring_of(sector) as f64 + 0.5);
+            (0..10_u8).map(move |k| TimedPoint {
+                position: DVec3::new(
+                    distance_m * azimuth.cos(),
+                    distance_m * azimuth.sin(),
+                    0.5 * f64::from(k) - 1.7,
+                )
+                .as_vec3(),
+                time_s: 0.0,
+            })
+        };
+        (0..60).flat_map(pole).collect()
+    }
+
+    #[test]
+    fn candidates_are_the_nearest_earlier_submap_and_those_that_look_alike() {
+        let (drive, maps) = two_rounds();
+        let random = |map: usize, sector: usize| {
+            let sine = ((61 * map + sector) as f64 * 12.9898).sin().abs();
+            (1e4 * sine) as usize % 20
+        };
+        // The eighth submap looks like the one before it but for every other pole, and like the first one, which it is
+        // turned by 30 and 42 degrees to.
+        let of_second = |sector: usize| random(1, (sector + 7) % 60);
+        let points: Vec<Vec<TimedPoint>> = (0..16)
+            .map(|map| match map {
+                7 => poles(|sector| match sector % 2 {
+                    0 => of_second((sector + 55) % 60),
+                    _ => random(7, sector),
+                }),
+                8 => poles(of_second),
+                map => poles(|sector| random(map, sector)),
+            })
+            .collect();
+        let contexts: Vec<ScanContext> = (points.iter())
+            .map(|points| ScanContext::new(points, 30.0))
+            .collect();
+        let candidates = |min_path_share, max_distance_share, similar_candidates| {
+            let config = LoopConfig {
+                min_path_share,
+                max_distance_share,
+                min_similarity: 0.4,
+                similar_candidates,
+                ..LoopConfig::default()
+            };
+            let search = LoopSearch {
+                drive: &drive,
+                maps: &maps,
+                points: &points,
+                contexts: &contexts,
+                drift: DRIFT,
+                config: &config,
+            };
+            let found = search.candidates(8);
+            let heading = |(map, pose): &(usize, Pose3)| {
+                assert!(pose.translation.vector.norm() < 1e-9);
+                (*map, pose.rotation.euler_angles().2.to_degrees().round())
+            };
+            found.iter().map(heading).collect::<Vec<_>>()
+        };
+        // Neighbours are 9.95 m apart: within 10 m and a drift of 0.5 m and 2 % of 80 m. More than 50 m of path lie between
+        // visits.
+        assert_eq!(candidates(1.0, 0.2, 2), [(0, 0.0), (1, 42.0)]);
+        assert_eq!(candidates(1.0, 0.2, 0), [(0, 0.0)]);
+        // Two metres and the drift, or 7.5 m and 8 m without it.
+        assert_eq!(candidates(1.0, 0.04, 2), [(0, 0.0)]);
+        assert_eq!(candidates(1.0, 0.15, 2), [(0, 0.0)]);
+        assert_eq!(candidates(1.0, 0.165, 2), [(0, 0.0), (1, 42.0)]);
+        // With paths of 7.5 m, but not with those of 10.5 m.
+        assert_eq!(candidates(0.15, 0.2, 3), [(0, 0.0), (1, 42.0), (7, 30.0)]);
+        assert_eq!(candidates(0.21, 0.2, 3), [(0, 0.0), (1, 42.0)]);
+        assert!(candidates(1.7, 0.2, 2).is_empty());
+    }
+
     #[test]
     fn the_common_share_is_that_of_the_points_on_the_surfaces_of_the_other_visit_without_the_ground()
      {

@@ -57,6 +57,37 @@ fn add_drifting(
     drifted
 }
 
+#[test]
+fn the_samples_of_all_scans_are_within_the_budget_of_memory() {
+    let (scans, _) = scans(&World::around_a_block(), 0.0, 2);
+    let points = |count: usize| -> usize {
+        let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default()).unwrap();
+        let added = scans[..count]
+            .iter()
+            .map(|scan| builder.keep(scan).unwrap());
+        added.for_each(drop);
+        builder
+            .samples
+            .iter()
+            .map(|sample| sample.points.len())
+            .sum()
+    };
+    let (one, both) = (points(1), points(2));
+    assert!(one > 0 && both > one);
+    let needs = |count: usize| (count as f64 * POINT_BYTES) as u64;
+    for (bytes, is_enough) in [
+        (needs(both), true),
+        (needs(both) - 1, false),
+        (needs(one), false),
+    ] {
+        let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default())
+            .unwrap()
+            .with_memory_budget(MemoryBudget { bytes });
+        assert!(builder.keep(&scans[0]).is_ok());
+        assert_eq!(builder.keep(&scans[1]).is_ok(), is_enough);
+    }
+}
+
 fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
     (a.translation.vector - b.translation.vector).norm()
 }
