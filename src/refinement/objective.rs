@@ -124,7 +124,10 @@ impl FrameObjective<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::TriangleMesh;
+    use crate::lidar::{LidarModel, RangeImage};
     use crate::map::world_for_tests::TestWorld;
+    use crate::rendering::CpuRenderer;
 
     impl TestWorld {
         /// The objective of a scan from the street.
@@ -138,6 +141,60 @@ mod tests {
                 attitude: SensorAttitude::default(),
                 difference: RangeDifference::truncated(0.5),
             }
+        }
+    }
+
+    #[test]
+    fn of_an_unknown_level_the_one_where_the_scan_fits_is_found() {
+        // A deck of 20 m over a yard of 60 m with a wall of 4 m.
+        let mut mesh = TriangleMesh::default();
+        let mut quad = |corners: [[f32; 3]; 4]| {
+            mesh.append(&TriangleMesh {
+                vertices: corners.map(Vec3::from).to_vec(),
+                triangles: vec![[0, 1, 2], [0, 2, 3]],
+                ..TriangleMesh::default()
+            });
+        };
+        for (half, z) in [(30.0, 0.0), (10.0, 6.0)] {
+            let corners = [(-half, -half), (half, -half), (half, half), (-half, half)];
+            quad(corners.map(|(x, y)| [x, y, z]));
+        }
+        for turn in 0..4 {
+            let wall = [(-30.0, 0.0), (30.0, 0.0), (30.0, 4.0), (-30.0, 4.0)];
+            quad(wall.map(|(along, z)| match turn {
+                0 => [along, 30.0, z],
+                1 => [along, -30.0, z],
+                2 => [30.0, along, z],
+                _ => [-30.0, along, z],
+            }));
+        }
+        let ground = GroundMap::from_mesh(&mesh, |triangle| triangle < 4, 0.5);
+        let renderer = CpuRenderer::new(std::slice::from_ref(&mesh));
+        let pose = Pose2::new(nalgebra::Vector2::new(1.0, -2.0), 0.3);
+        for level_m in [0.0, 6.0] {
+            let patch = ground.patch_under(&pose, Some(level_m)).unwrap().unwrap();
+            let lifted = patch.lift(&pose, &SensorAttitude::default());
+            let model = LidarModel {
+                height: 32,
+                width: 360,
+                ..LidarModel::default()
+            };
+            let image = renderer.render(&[lifted], &model).unwrap().remove(0);
+            let beams: Vec<Beam> = RangeImage::from_ranges(image, &model).beams().collect();
+            let objective = FrameObjective {
+                renderer: &renderer,
+                ground: &ground,
+                beams: &beams,
+                registered: &beams,
+                level_m: None,
+                attitude: SensorAttitude::default(),
+                difference: RangeDifference::truncated(0.5),
+            };
+            let found = objective.on_best_level(&pose).unwrap().level_m.unwrap();
+            assert!((found - level_m).abs() < 0.01, "{found}");
+            // Next to the deck there is one level.
+            let beside = objective.on_best_level(&Pose2::translation(20.0, 0.0));
+            assert!(beside.unwrap().level_m.unwrap().abs() < 0.01);
         }
     }
 

@@ -395,6 +395,35 @@ mod tests {
     }
 
     #[test]
+    fn an_estimate_is_wide_if_its_reach_exceeds_thirty_centimetres_or_a_twenty_fifth_of_a_radian() {
+        let config = FrameRefinementConfig {
+            reach_sigmas: 2.0,
+            ..FrameRefinementConfig::default()
+        };
+        let is_wide = |method: Method, sigmas: [f64; 3]| {
+            let config = FrameRefinementConfig {
+                method,
+                ..config.clone()
+            };
+            let sigmas = Vector3::from(sigmas);
+            config.is_wide(&Matrix3::from_diagonal(&sigmas.component_mul(&sigmas)))
+        };
+        for (sigmas, expected) in [
+            ([0.15, 0.15, 0.02], false),
+            ([0.16, 0.0, 0.0], true),
+            ([0.0, 0.16, 0.0], true),
+            ([0.0, 0.0, 0.021], true),
+        ] {
+            assert_eq!(is_wide(Method::Both, sigmas), expected, "{sigmas:?}");
+            assert!(!is_wide(Method::Swarm, sigmas) && !is_wide(Method::GaussNewton, sigmas));
+        }
+        // From the least to the largest reach.
+        let covariance = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e4, 0.01));
+        let reach = config.reach(&covariance);
+        assert_eq!(reach, [config.min_reach_m, config.max_reach_m, 0.2]);
+    }
+
+    #[test]
     fn a_correct_estimate_stays_correct() {
         for seed in 0..3 {
             let (frame, truth) = refine(Method::Both, &Pose2::identity(), seed);

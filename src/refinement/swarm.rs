@@ -374,6 +374,112 @@ mod tests {
     }
 
     #[test]
+    fn the_inertia_decreases_linearly_from_the_first_iteration_to_the_last() {
+        // Without acceleration, a velocity is multiplied by the inertia of each iteration.
+        let config = SwarmConfig {
+            candidates: 8,
+            iterations: 4,
+            inertia: 0.9,
+            final_inertia: 0.3,
+            cognitive: 0.0,
+            social: 0.0,
+            ..SwarmConfig::default()
+        };
+        let mut positions: Vec<Vec<f64>> = Vec::new();
+        let batch = |all: &[[f64; 1]]| -> Result<Vec<f64>, Infallible> {
+            positions.push(all.iter().map(|position| position[0]).collect());
+            Ok(vec![1.0; all.len()])
+        };
+        let wide = Dimension {
+            reach: 1e3,
+            ..dimension(2.0)
+        };
+        let Ok(_) = minimize(&[wide], &config, batch, &mut StdRng::seed_from_u64(3));
+        assert_eq!(positions.len(), 5);
+        for candidate in 0..8 {
+            let moved = |iteration: usize| {
+                positions[iteration + 1][candidate] - positions[iteration][candidate]
+            };
+            // At first up to 0.3 of the reach.
+            let first = moved(0) / 0.9;
+            assert!(first.abs() <= 300.0 && first.abs() > 0.1, "{first}");
+            let mut expected = first;
+            for (iteration, inertia) in [0.9, 0.7, 0.5, 0.3].into_iter().enumerate() {
+                expected *= inertia;
+                assert!((moved(iteration) - expected).abs() < 1e-9);
+            }
+        }
+    }
+
+    #[test]
+    fn initial_candidates_have_the_spread_of_their_dimension_and_uniform_velocities() {
+        let config = SwarmConfig {
+            candidates: 10_000,
+            ..SwarmConfig::default()
+        };
+        let dimensions = [Dimension {
+            start: 3.0,
+            spread: 0.5,
+            reach: 100.0,
+            is_circular: false,
+        }];
+        let swarm = initial_swarm(&dimensions, &config, &mut StdRng::seed_from_u64(4));
+        assert_eq!(swarm[0].position, [3.0]);
+        let n = swarm.len() as f64;
+        let mean = |value: &dyn Fn(&Candidate<1>) -> f64| swarm.iter().map(value).sum::<f64>() / n;
+        // Four standard errors, of a normal distribution and of a uniform one up to 0.3 of the reach.
+        assert!((mean(&|c| c.position[0] - 3.0)).abs() < 4.0 * 0.5 / n.sqrt());
+        let variance = mean(&|c| (c.position[0] - 3.0).powi(2));
+        assert!((variance - 0.25).abs() < 4.0 * 0.25 * (2.0 / n).sqrt());
+        assert!(swarm.iter().all(|c| c.velocity[0].abs() <= 30.0));
+        assert!((mean(&|c| c.velocity[0])).abs() < 4.0 * (300.0 / n).sqrt());
+        let variance = mean(&|c| c.velocity[0].powi(2));
+        let error = 900.0 * (1.0_f64 / 5.0 - 1.0 / 9.0).sqrt() / n.sqrt();
+        assert!((variance - 300.0).abs() < 4.0 * error, "{variance}");
+    }
+
+    #[test]
+    fn both_accelerations_are_uniform_up_to_their_factors_and_velocities_are_limited() {
+        let config = SwarmConfig {
+            cognitive: 1.6,
+            social: 0.8,
+            max_velocity: 0.5,
+            ..SwarmConfig::default()
+        };
+        let dimensions = [Dimension {
+            start: 0.0,
+            spread: 1.0,
+            reach: 100.0,
+            is_circular: false,
+        }];
+        let mut rng = StdRng::seed_from_u64(5);
+        let mut moved = |own_best: f64, best: f64| {
+            let mut candidate = Candidate {
+                position: [1.0],
+                velocity: [2.0],
+                best_position: [own_best],
+                best_value: 0.0,
+            };
+            advance(&mut candidate, &[best], &dimensions, 0.5, &config, &mut rng);
+            assert_eq!(candidate.position, [1.0 + candidate.velocity[0]]);
+            candidate.velocity[0]
+        };
+        let count = 10_000;
+        // Mean and variance of half of the velocity and of the uniform shares of both ways, of -10 and 4 m.
+        let velocities: Vec<f64> = (0..count).map(|_| moved(-9.0, 5.0)).collect();
+        let n = f64::from(count);
+        let mean = velocities.iter().sum::<f64>() / n;
+        let variance = velocities.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n;
+        let expected = (16.0_f64.powi(2) + 3.2_f64.powi(2)) / 12.0;
+        assert!((mean - (1.0 - 8.0 + 1.6)).abs() < 4.0 * (expected / n).sqrt());
+        assert!((variance / expected - 1.0).abs() < 4.0 * (2.0 / n).sqrt());
+        // A share of the reach of 100 m.
+        let far: Vec<f64> = (0..100).map(|_| moved(1000.0, 1000.0)).collect();
+        assert!(far.iter().all(|velocity| *velocity <= 50.0));
+        assert!(far.contains(&50.0));
+    }
+
+    #[test]
     fn nan_is_never_the_minimum() {
         let half = |x: &[f64]| if x[0] > 0.0 { f64::NAN } else { -x[0] };
         let minimum = run(&[dimension(-2.0)], &many(), 1, half);

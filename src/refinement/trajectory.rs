@@ -742,6 +742,116 @@ mod tests {
     }
 
     #[test]
+    fn a_rough_trajectory_is_deskewed_by_all_of_its_odometry() {
+        let step = Pose2::new(Vector2::new(1.0, 0.1), 0.05);
+        let poses = [0.0, 1.0, 2.5, 4.0].map(|x| Pose2::translation(x, 0.0));
+        // The first increment leads to no frame.
+        let elsewhere = Pose2::translation(9.0, 9.0);
+        let increments = [elsewhere, step, step, step * step].map(Some);
+        let path = [
+            Pose2::identity(),
+            step,
+            step * step,
+            step * step * step * step,
+        ];
+        let path = path.map(|pose| pose3_from_pose2(&pose, 0.0));
+        let driven = InitialEstimate::driven(&increments).unwrap();
+        assert_eq!(driven.len(), path.len());
+        for (driven, expected) in driven.iter().zip(&path) {
+            assert_relative_eq!(driven, expected, epsilon = 1e-12);
+        }
+        assert_eq!(InitialEstimate::driven(&[]), Some(vec![]));
+        let times_s = [0.0, 0.1, 0.2, 0.4];
+        let rough = |increments: &[Option<Pose2>], times_s: Option<&[f64]>| {
+            InitialEstimate::from_rough(&poses, [0.5, 0.25], increments, times_s)
+        };
+        let found = rough(&increments, Some(&times_s));
+        assert_eq!(found.len(), poses.len());
+        for (row, found) in found.into_iter().enumerate() {
+            let covariance = Matrix3::from_diagonal(&Vector3::new(0.25, 0.25, 0.0625));
+            let expected = InitialEstimate {
+                pose: poses[row],
+                covariance: Some(covariance),
+                state: State::Tracking,
+                motion: Motion::along(&driven, &times_s, row),
+                increment: increments[row].filter(|_| row > 0),
+            };
+            assert!(expected.motion.is_some());
+            assert_eq!(found, expected);
+        }
+        let missing = [Some(elsewhere), Some(step), None, Some(step)];
+        assert_eq!(InitialEstimate::driven(&missing), None);
+        for found in [rough(&missing, Some(&times_s)), rough(&increments, None)] {
+            assert!(found.iter().all(|estimate| estimate.motion.is_none()));
+            assert_eq!(found[1].increment, Some(step));
+        }
+    }
+
+    #[test]
+    fn scans_of_a_filter_are_deskewed_by_the_estimates_if_those_around_them_were_tracked() {
+        let step = Pose2::new(Vector2::new(1.0, 0.1), 0.05);
+        let poses: Vec<Pose2> = (0..7)
+            .map(|row| Pose2::translation(1.2 * f64::from(row), 0.0))
+            .collect();
+        let states = [0, 0, 1, 0, 0, 0, 0].map(|it| [State::Tracking, State::Searching][it]);
+        let times_s: Vec<f64> = (0..7).map(|row| 0.1 * f64::from(row)).collect();
+        let increments = [Some(step); 7];
+        let covariances: Vec<Matrix3<f64>> = (1..8)
+            .map(|row| Matrix3::identity() * f64::from(row))
+            .collect();
+        let driven = InitialEstimate::driven(&increments).unwrap();
+        let estimated: Vec<Pose3> = (poses.iter())
+            .map(|pose| pose3_from_pose2(pose, 0.0))
+            .collect();
+        let given = Some(&covariances[..]);
+        let found =
+            InitialEstimate::from_filter(&poses, given, &states, &increments, Some(&times_s));
+        assert_eq!(found.len(), poses.len());
+        for (row, found) in found.into_iter().enumerate() {
+            let is_known = row == 0 || row > 3;
+            let path = if is_known { &estimated } else { &driven };
+            let expected = InitialEstimate {
+                pose: poses[row],
+                covariance: Some(covariances[row]),
+                state: states[row],
+                motion: Motion::along(path, &times_s, row),
+                increment: (row > 0).then_some(step),
+            };
+            assert_eq!(found, expected, "{row}");
+        }
+    }
+
+    #[test]
+    fn upright_surfaces_are_those_of_the_one_mesh_of_a_map_in_memory() {
+        let map = TestWorld::street().map();
+        let refiner = TrajectoryRefiner::new(&map, &sensor(), RefinerConfig::default(), 0).unwrap();
+        let near = |x: f64| refiner.surfaces_near(&Pose2::translation(x, 0.0)).unwrap();
+        let (first, same, other) = (near(10.0), near(40.0), near(60.0));
+        assert!(Arc::ptr_eq(&first, &same) && Arc::ptr_eq(&first, &other));
+    }
+
+    #[test]
+    fn a_frame_at_a_predicted_pose_is_refined_from_there_only() {
+        let frame = FrameResult {
+            pose: Pose2::identity(),
+            map_from_lidar: None,
+            covariance: Matrix3::identity(),
+            state: State::Searching,
+            change: None,
+            attitude: SensorAttitude::default(),
+            level_m: Some(3.0),
+        };
+        let predicted = Pose2::translation(1.0, 2.0);
+        let expected = FrameResult {
+            pose: predicted,
+            covariance: Matrix3::zeros(),
+            state: State::Tracking,
+            ..frame.clone()
+        };
+        assert_eq!(frame.near(predicted), expected);
+    }
+
+    #[test]
     fn a_frame_has_the_covariance_of_its_refinement() {
         let world = TestWorld::street();
         let truth = world.pose_at(10.0, 0.0, 0.0);
@@ -765,6 +875,53 @@ mod tests {
         assert_eq!(covariance(Method::None), given);
         let registered = covariance(Method::GaussNewton);
         assert!(registered.trace() < 0.1 * given.trace(), "{registered}");
+    }
+
+    #[test]
+    fn stretches_end_where_tracking_is_lost_and_where_the_odometry_contradicts_tracked_poses() {
+        use State::{Lost, Searching, Tracking};
+        let map = TestWorld::street().map();
+        let stretches = |frames: &[(f64, State)], increment: Pose2| {
+            let mut refiner =
+                TrajectoryRefiner::new(&map, &sensor(), RefinerConfig::default(), 0).unwrap();
+            for &(x, state) in frames {
+                refiner.frames.push(FrameResult {
+                    pose: Pose2::translation(x, 0.0),
+                    map_from_lidar: None,
+                    covariance: Matrix3::identity(),
+                    state,
+                    change: None,
+                    attitude: SensorAttitude::default(),
+                    level_m: None,
+                });
+            }
+            refiner.tracked_stretches(&vec![increment; frames.len()])
+        };
+        let metre = Pose2::translation(1.0, 0.0);
+        let drive = |states: &[State]| {
+            let frames: Vec<_> = (states.iter().enumerate())
+                .map(|(row, &state)| (row as f64, state))
+                .collect();
+            stretches(&frames, metre)
+        };
+        assert_eq!(drive(&[Tracking; 5]), [0..5]);
+        let lost = [Tracking, Tracking, Lost, Lost, Tracking, Searching];
+        assert_eq!(drive(&lost), [0..2, 4..6]);
+        // Stretches without a measured frame are not smoothed.
+        assert_eq!(drive(&[Searching, Searching, Lost, Tracking]), [3..4]);
+        assert!(drive(&[Lost, Lost]).is_empty());
+        // A metre and a fifth of the way is no contradiction: 1.4 m of 2.4 m, but not 1.6 m of 2.6 m, either way.
+        let step = |way_m: f64, increment: Pose2, state: State| {
+            let frames = [(0.0, Tracking), (way_m, state)];
+            stretches(&frames, increment).len()
+        };
+        for (way_m, expected) in [(2.4, 1), (2.6, 2), (-0.2, 2), (-0.1, 2), (0.1, 1)] {
+            assert_eq!(step(way_m, metre, Tracking), expected, "{way_m}");
+            assert_eq!(step(way_m, metre, Searching), 1);
+        }
+        for (turn_rad, expected) in [(0.19, 1), (0.21, 2), (-0.19, 1), (-0.21, 2)] {
+            assert_eq!(step(0.0, Pose2::rotation(turn_rad), Tracking), expected);
+        }
     }
 
     #[test]

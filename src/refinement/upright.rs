@@ -215,6 +215,56 @@ mod tests {
     }
 
     #[test]
+    fn heights_are_above_the_plane_of_a_sloping_ground() {
+        let surfaces = UprightSurfaces::new(&wall());
+        let is_near = |height_m: f64| {
+            // The ground rises by sqrt(2) m per metre along x and by 1 m per metre along y: at the wall, 4 m ahead and 2 m
+            // aside, it is 7.66 m higher than at the centre.
+            let slope = GroundPatch {
+                height_m,
+                normal: nalgebra::Vector3::new(-0.5_f64.sqrt(), -0.5, 0.5),
+            };
+            let field = surfaces.distances(Vector2::new(1.0, 2.0), &slope, 8.0, 3.0);
+            field.at(5.0, 4.0) < 0.5
+        };
+        // The wall of 4 m has parts that are 0.4 to 6 m above it if the centre is at -13.66 to -4.06 m.
+        for height_m in [-13.0, -11.0, -8.0, -5.0] {
+            assert!(is_near(height_m), "{height_m}");
+        }
+        for height_m in [-15.0, -3.0, 0.0, 8.0] {
+            assert!(!is_near(height_m), "{height_m}");
+        }
+    }
+
+    #[test]
+    fn distances_are_those_of_a_raster_transform_within_a_cell() {
+        let mut field = DistanceField::empty(Vector2::new(3.0, -2.0), 4.0, 2.5);
+        let occupied = [(1.7, -3.9), (4.1, -0.3)];
+        occupied.iter().for_each(|&(x, y)| field.occupy(x, y));
+        field.transform();
+        for i in 0..41 {
+            for j in 0..41 {
+                let (x, y) = (-0.9 + 0.2 * f64::from(i), -5.9 + 0.2 * f64::from(j));
+                let exact = |&(a, b): &(f64, f64)| {
+                    // Steps to the eight neighbours.
+                    let (dx, dy) = ((x - a).abs(), (y - b).abs());
+                    dx.max(dy) + (std::f64::consts::SQRT_2 - 1.0) * dx.min(dy)
+                };
+                let expected = occupied.iter().map(exact).fold(2.5, f64::min) as f32;
+                let found = field.at(x, y);
+                assert!(
+                    (found - expected).abs() < 1e-3,
+                    "{x} {y} {found} {expected}"
+                );
+            }
+        }
+        // Outside the grid.
+        for (x, y) in [(-1.1, -2.0), (7.3, -2.0), (3.0, -6.1), (3.0, 2.3)] {
+            assert_eq!(field.at(x, y), 2.5);
+        }
+    }
+
+    #[test]
     fn surfaces_below_the_plane_of_the_ground_do_not_count() {
         let surfaces = UprightSurfaces::new(&wall());
         let above = GroundPatch {

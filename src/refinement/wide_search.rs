@@ -227,6 +227,43 @@ mod tests {
     }
 
     #[test]
+    fn swarms_come_so_near_to_the_pose_that_a_narrow_kernel_finishes() {
+        let world = TestWorld::street();
+        let map = world.map();
+        let surfaces = UprightSurfaces::new(&map.mesh().unwrap());
+        let truth = world.pose_at(18.0, 0.2, 0.5);
+        let beams: Vec<Beam> = world.scan(&truth).beams().step_by(5).collect();
+        let objective = world.objective(&beams);
+        let config = WideSearchConfig {
+            kernel_m: 0.1,
+            ..WideSearchConfig::default()
+        };
+        for (seed, [x, y, turn_rad]) in [[2.0, -1.5, 0.4], [-2.5, 1.0, -0.5]]
+            .into_iter()
+            .enumerate()
+        {
+            let estimate = truth * Pose2::new(Vector2::new(x, y), turn_rad);
+            let reach = [3.0, 3.0, 0.6];
+            let mut rng = StdRng::seed_from_u64(seed as u64);
+            let registration = RegistrationConfig::default();
+            let found = search(
+                &objective,
+                &surfaces,
+                &estimate,
+                reach,
+                &registration,
+                &config,
+                &mut rng,
+            );
+            let (pose, cost_m) = found.unwrap().unwrap();
+            let error = truth.inverse() * pose2_from_pose3(&pose);
+            assert!(error.translation.vector.norm() < 0.02, "{error}");
+            assert!(error.rotation.angle().abs() < 0.005, "{error}");
+            assert!(cost_m < 0.01, "{cost_m}");
+        }
+    }
+
+    #[test]
     fn minima_that_are_near_each_other_are_one() {
         let at = |x: f64, value: f64| ([x, 0.0, 0.0], value);
         let minima = [at(0.0, 0.1), at(0.1, 0.2), at(2.0, 0.3), at(4.0, 0.4)];
