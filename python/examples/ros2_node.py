@@ -25,7 +25,7 @@ class Localization(Node):
     def __init__(self, map_file):
         super().__init__("fpmcl_localization")
         self.base_frame = self.declare_parameter("base_frame", "base_link").value
-        self.localizer = fpmcl.Localizer(fpmcl.Map.load(map_file, cache=True))
+        self.localizer = fpmcl.Localizer(fpmcl.Map.load(map_file, cache=True), real_time=True)
         self.poses = self.create_publisher(PoseWithCovarianceStamped, "pose", 10)
         self.transforms, self.known = TransformBroadcaster(self), Buffer()
         self.listener = TransformListener(self.known, self)

@@ -21,7 +21,8 @@ use crate::settings;
 ///
 /// ``start``: ``"anywhere"`` (the default in maps of up to 1 km²), ``"road"`` (anywhere along the mapping drive), or a pose nearby: (3,), x, y
 /// [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan,
-/// own car and times of points from the first that show motion; better that of a Recording. Settings: fields of
+/// own car and times of points from the first that show motion; better that of a Recording. ``real_time``: no scan waits until
+/// these are inferred, which takes seconds; from which scan on they are used depends on the machine. Settings: fields of
 /// ``tracker`` in ``fpmcl config localize --full``, such as ``seed``, ``num_particles``, and ``odometry=None`` for
 /// constant velocity where no motion is given.
 #[pyclass(module = "fpmcl")]
@@ -32,11 +33,12 @@ pub struct Localizer {
 #[pymethods]
 impl Localizer {
     #[new]
-    #[pyo3(signature = (map, start=None, *, sensor=None, **settings))]
+    #[pyo3(signature = (map, start=None, *, sensor=None, real_time=false, **settings))]
     fn new(
         #[pyo3(from_py_with = map_of)] map: Bound<'_, Map>,
         start: Option<&Bound<'_, PyAny>>,
         sensor: Option<Sensor>,
+        real_time: bool,
         settings: Option<&Bound<'_, PyDict>>,
     ) -> PyResult<Self> {
         let map = map.get();
@@ -46,6 +48,7 @@ impl Localizer {
         Ok(Self {
             tracker: match sensor {
                 Some(sensor) => tracker.with_sensor(sensor.0),
+                None if real_time => tracker.in_real_time(),
                 None => tracker,
             },
         })

@@ -173,6 +173,17 @@ def test_a_given_start_and_a_given_motion_are_used(folder, recording):
         fpmcl.Localizer(loaded, "nowhere")
 
 
+def test_in_real_time_the_first_scans_have_the_same_estimates(folder, recording):
+    loaded = fpmcl.Map.load(folder / "map.ply", backend="cpu")
+    start = recording.poses_in(loaded)[0]
+    waiting, real_time = (
+        fpmcl.Localizer(loaded, start, real_time=real_time, numParticles=500) for real_time in (False, True)
+    )
+    for index in range(3):
+        expected, found = (localizer.step(recording[index]) for localizer in (waiting, real_time))
+        np.testing.assert_array_equal(found.map_from_lidar, expected.map_from_lidar)
+
+
 def test_rough_poses_are_refined(folder, recording):
     loaded = fpmcl.Map.load(folder / "map.ply", backend="cpu")
     truth = recording.poses_in(loaded)

@@ -195,9 +195,10 @@ class Localizer:
     """Estimates the pose of a car in a map from its scans. The same seed gives the same estimates.
 
     ``start``: ``"anywhere"`` (the default in maps of up to 1 km²), ``"road"`` (anywhere along the mapping drive), or a pose
-    nearby: (3,), x, y [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan; better that of a
-    Recording. Settings: fields of ``tracker`` in ``fpmcl config localize --full``, and ``odometry=None`` for constant velocity
-    where no motion is given.
+    nearby: (3,), x, y [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan, own car and times of
+    points from the first that show motion; better that of a Recording. ``real_time``: no scan waits until these are inferred,
+    which takes seconds; from which scan on they are used depends on the machine. Settings: fields of ``tracker`` in ``fpmcl
+    config localize --full``, and ``odometry=None`` for constant velocity where no motion is given.
     """
 
     def __new__(
@@ -206,6 +207,7 @@ class Localizer:
         start: Union[Literal["anywhere", "road"], ArrayLike, None] = None,
         *,
         sensor: Optional[Sensor] = None,
+        real_time: bool = False,
         **settings: Any,
     ) -> Localizer: ...
     def step(
