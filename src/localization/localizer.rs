@@ -194,7 +194,7 @@ impl Localizer {
     }
 
     /// Pose of a scan whose points have times, by a registration of some of them with the predicted motion during the sweep;
-    /// `None` while the filter is not tracking.
+    /// `None` without times, while the filter is not tracking, and where registration fails.
     fn registered(
         &self,
         scan: &Scan,

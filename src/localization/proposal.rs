@@ -6,7 +6,7 @@
 //!
 //! ```text
 //! prior        N(m, P)     the predicted particles
-//! likelihood   N(s, S)     registration of the scan with the map, starting at m
+//! likelihood   N(s, S)     registration of the scan with the map, from the pose that gave the motion during its sweep, else from m
 //! posterior    N(q, Q)     Q = (P⁻¹ + S⁻¹)⁻¹,   q = m + Q S⁻¹ (s − m)
 //! ```
 //!

@@ -7,7 +7,7 @@
 //! v = m + ½ (m − m')
 //! ```
 //!
-//! The pose of this frame is found first with the scan deskewed by m', then again with v. Odometry is used
+//! The pose of this frame is found first with the scan deskewed by m', then, from there, with v. Odometry is used
 //! until there are two frames in a row in which the filter was tracking.
 
 use super::odometry::Odometry;

@@ -49,10 +49,10 @@ impl RegistrationConfig {
         Matrix3::from_diagonal(&deviations.component_mul(&deviations))
     }
 
-    /// The settings for a pose that is needed within a distance only [m].
-    pub(crate) fn within(&self, distance_m: f64) -> Self {
+    /// The settings with a tolerance of at least that [m], for a pose that another registration continues.
+    pub(crate) fn with_tolerance(&self, tolerance_m: f64) -> Self {
         Self {
-            tolerance_m: self.tolerance_m.max(distance_m),
+            tolerance_m: self.tolerance_m.max(tolerance_m),
             ..self.clone()
         }
     }

@@ -42,7 +42,7 @@ use crate::geometry::{Pose3, Rigid3f, RobustKernel, azimuth_sector};
 use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
 
-/// Last step of a registration after which another one follows [m].
+/// Tolerance of a registration that another one continues [m].
 const NEAR_M: f64 = 0.01;
 
 /// A registered pose with its covariance.
@@ -52,7 +52,7 @@ pub(crate) struct RegistrationResult {
     pub map_from_lidar: Pose3,
     /// Covariance of (x, y, z, roll, pitch, yaw) in the lidar frame [m, rad].
     pub covariance: Matrix6<f64>,
-    /// Number of iterations, one ray per beam each.
+    /// Number of iterations of the last stage.
     pub iterations: usize,
 }
 
@@ -81,14 +81,15 @@ pub(crate) fn register(
     config: &RegistrationConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
     let residuals = linearize(renderer, beams, initial, config)?;
-    descend(renderer, beams, (*initial, residuals), config)
+    descend(renderer, beams, *initial, residuals, config)
 }
 
 /// Registers beams, starting at a pose with its residuals.
 fn descend(
     renderer: &dyn RangeRenderer,
     beams: &[Beam],
-    (mut pose, mut residuals): (Pose3, Vec<Residual>),
+    mut pose: Pose3,
+    mut residuals: Vec<Residual>,
     config: &RegistrationConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
     /// Lever of rotations [m].
@@ -151,13 +152,13 @@ pub(crate) fn register_informative(
     }
     let step = beams.len().div_ceil(COARSE);
     let some: Vec<Beam> = beams.iter().step_by(step).copied().collect();
-    let near = register(renderer, &some, initial, &config.within(NEAR_M))?;
+    let near = register(renderer, &some, initial, &config.with_tolerance(NEAR_M))?;
     let near = near.map_or(*initial, |near| near.map_from_lidar);
     let mut residuals = linearize(renderer, beams, &near, config)?;
     let chosen = informative::choose(&residuals, FINE, config);
     residuals.retain(|residual| chosen.binary_search(&residual.beam).is_ok());
     let chosen: Vec<Beam> = chosen.iter().map(|&beam| beams[beam]).collect();
-    descend(renderer, &chosen, (near, residuals), config)
+    descend(renderer, &chosen, near, residuals, config)
 }
 
 /// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second
@@ -172,7 +173,7 @@ pub(crate) fn register_coarse_to_fine(
 ) -> Result<Option<RegistrationResult>, RenderError> {
     let wide = RegistrationConfig {
         kernel_m: config.kernel_m.max(wide_kernel_m),
-        ..config.within(NEAR_M)
+        ..config.with_tolerance(NEAR_M)
     };
     let (mut pose, mut result) = (*initial, None);
     for (beams, config) in beams.into_iter().zip([&wide, config]) {

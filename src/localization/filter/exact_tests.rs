@@ -194,7 +194,7 @@ fn places_weigh_by_the_particles_in_them_and_by_the_costs_of_their_scans() {
         assert_relative_eq!(update.pose.unwrap(), a, epsilon = 1e-9);
         assert_relative_eq!(update.mean_cost_m.unwrap(), of_b * cost_m, epsilon = 1e-7);
         assert_eq!(filter.phase.search(), Some(Search::Places { likely }));
-        // The particles of a place are at most 2.5 m off in each direction, as a standard deviation.
+        // Standard deviation of the position in a place: half of its radius of 5 m.
         let particles = filter.particles.particles();
         let (in_a, in_b): (Vec<&Particle>, Vec<&Particle>) =
             (particles.iter()).partition(|it| it.map_from_lidar.translation.x < 15.0);
@@ -487,7 +487,7 @@ fn a_registration_beyond_six_standard_deviations_of_the_prediction_is_rejected()
         filter.phase = Phase::Tracking;
         let mut rng = StdRng::seed_from_u64(1);
         let attitude = SensorAttitude::default();
-        let proposal = filter.propose(&world.scan(&truth), &attitude, &mut rng);
+        let proposal = filter.propose(&world.scan(&truth), &attitude, None, &mut rng);
         proposal.unwrap().is_some()
     };
     // The registration is right to a few millimetres.

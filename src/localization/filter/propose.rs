@@ -6,14 +6,14 @@ use rand::Rng;
 use super::phase::Phase;
 use super::reweight::Update;
 use super::state::ParticleFilter;
-use crate::geometry::{Pose3, pose2_from_pose3};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::observation::{choose_beams, costs_of_scan};
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::SensorAttitude;
-use crate::registration::{register, register_informative};
+use crate::registration::{RegistrationConfig, register, register_informative};
 use crate::rendering::RenderError;
 
 /// Distance from the prior beyond which a registration is rejected (standard deviations): of normal errors of x, y and heading,
@@ -41,8 +41,8 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Option<Pose3>, RenderError> {
-        /// Last step [m], which is a millimetre of the motion during a sweep.
-        const WITHIN_M: f64 = 1e-3;
+        /// Tolerance [m]: it changes the motion during the sweep by about a millimetre.
+        const TOLERANCE_M: f64 = 1e-3;
         let config = &self.config.proposal;
         let pending = self.pending.unwrap_or_default().motion;
         let predicted = self.particles.mean() * pending * self.increment(odometry);
@@ -53,17 +53,28 @@ impl ParticleFilter {
         let count = config.compared_beams;
         let beams = choose_beams(scan, count, config.road_share, attitude, rng);
         let start = patch.lift(&predicted, attitude);
-        let registration = config.registration.within(WITHIN_M);
+        let registration = self.registration().with_tolerance(TOLERANCE_M);
         let found = register(&*self.map.renderer, &beams, &start, &registration)?;
         Ok(found.map(|found| found.map_from_lidar))
     }
 
-    /// Registers the scan with the map and fuses the result with the prediction; `None` while the
-    /// distribution is wide, where registration fails, and where its result is implausible.
+    /// Settings of the registration, cautious ones while the pose is not certain.
+    fn registration(&self) -> RegistrationConfig {
+        let config = &self.config.proposal.registration;
+        match self.phase {
+            Phase::Tracking => config.clone(),
+            _ => config.cautious(),
+        }
+    }
+
+    /// Registers the scan with the map, from a pose near its own if that is plausible, else from the prediction, and fuses the
+    /// result with the prediction; `None` while the distribution is wide, where registration fails, and where its result is
+    /// implausible.
     pub(super) fn propose(
         &self,
         scan: &RangeImage,
         attitude: &SensorAttitude,
+        near: Option<Pose3>,
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
         let config = &self.config.proposal;
@@ -76,24 +87,24 @@ impl ParticleFilter {
         };
         let mut choose = |count| choose_beams(scan, count, config.road_share, attitude, rng);
         let (registered, beams) = (choose(config.beams), choose(config.compared_beams));
-        let start = (self.near).unwrap_or_else(|| patch.lift(&mean, attitude));
-        let registration = match self.phase {
-            Phase::Tracking => &config.registration,
-            _ => &config.registration.cautious(),
-        };
-        let renderer = &*self.map.renderer;
-        let Some(found) = register_informative(renderer, &registered, &start, registration)? else {
+        let Some(prior) = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)))
+        else {
             return Ok(None);
         };
-        let prior = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)));
+        let is_plausible = |pose: &Pose2| prior.squared_distance(pose) <= MAX_SIGMAS.powi(2);
+        let near = near.filter(|near| is_plausible(&pose2_from_pose3(near)));
+        let start = near.unwrap_or_else(|| patch.lift(&mean, attitude));
+        let renderer = &*self.map.renderer;
+        let registration = self.registration();
+        let Some(found) = register_informative(renderer, &registered, &start, &registration)?
+        else {
+            return Ok(None);
+        };
         let pose = pose2_from_pose3(&found.map_from_lidar);
         let measured = Gaussian::new(pose, regular(&found.planar_covariance()));
-        let (Some(prior), Some(measured)) = (prior, measured) else {
+        let Some(measured) = measured.filter(|_| is_plausible(&pose)) else {
             return Ok(None);
         };
-        if prior.squared_distance(&measured.mean) > MAX_SIGMAS.powi(2) {
-            return Ok(None);
-        }
         let Some(gaussian) = prior.fused(&measured) else {
             return Ok(None);
         };
@@ -133,7 +144,6 @@ mod tests {
     use rand::{SeedableRng as _, rngs::StdRng};
 
     use super::*;
-    use crate::geometry::Pose2;
     use crate::localization::LocalizerConfig;
     use crate::localization::particles::deviation;
     use crate::map::world_for_tests::TestWorld;
@@ -179,7 +189,10 @@ mod tests {
         let off = deviation(&pose2_from_pose3(&found.map_from_lidar), &mean);
         let shift = expected * measured * off;
 
-        let posterior = filter.propose(&scan, &attitude, &mut rng).unwrap().unwrap();
+        let posterior = filter
+            .propose(&scan, &attitude, None, &mut rng)
+            .unwrap()
+            .unwrap();
         filter.sample(posterior, &mut rng);
         let pose = filter.particles.mean();
         assert_eq!(filter.particles.len(), filter.config.num_reduced);
@@ -189,7 +202,32 @@ mod tests {
     }
 
     #[test]
-    fn of_three_particles_or_fewer_the_pose_is_their_mean() {
+    fn a_registration_starts_at_a_plausible_pose_instead_of_the_prediction() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let attitude = SensorAttitude::default();
+        let at_truth = world.ground.lift(&truth, &attitude).unwrap();
+        let error_m = |mean: Pose2, sigma_m: f64, near: Option<Pose3>| {
+            let mut rng = StdRng::seed_from_u64(1);
+            let sigmas = Vector3::new(sigma_m, sigma_m, 0.01);
+            let covariance = nalgebra::Matrix3::from_diagonal(&sigmas.component_mul(&sigmas));
+            let prior = Gaussian::new(mean, covariance).unwrap();
+            let filter = tracking(&world, &prior, &mut rng);
+            let found = filter.propose(&world.scan(&truth), &attitude, near, &mut rng);
+            let off = |found: Posterior| deviation(&found.gaussian.mean, &truth).xy().norm();
+            found.unwrap().map_or(f64::INFINITY, off)
+        };
+        // The prediction is off by more than the gates of the registration.
+        let aside = truth * Pose2::translation(0.0, 1.5);
+        assert!(error_m(aside, 1.0, at_truth) < 0.01);
+        assert!(error_m(aside, 1.0, None) > 0.1);
+        // The given pose is, by 15 standard deviations.
+        let off = world.ground.lift(&aside, &attitude).unwrap();
+        assert!(error_m(truth, 0.1, off) < 0.01);
+    }
+
+    #[test]
+    fn of_three_particles_or_fewer_the_pose_is_not_that_of_the_posterior() {
         let world = TestWorld::street();
         let truth = world.pose_at(12.0, 0.2, 0.05);
         let covariance = nalgebra::Matrix3::identity() * 1e-6;
@@ -199,7 +237,7 @@ mod tests {
             let mut filter = tracking(&world, &prior, &mut rng);
             filter.config.num_reduced = count;
             let attitude = SensorAttitude::default();
-            let posterior = filter.propose(&world.scan(&truth), &attitude, &mut rng);
+            let posterior = filter.propose(&world.scan(&truth), &attitude, None, &mut rng);
             let posterior = posterior.unwrap().unwrap();
             let mean = posterior.gaussian.mean;
             let update = filter.sample(posterior, &mut rng);

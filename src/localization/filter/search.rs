@@ -131,11 +131,11 @@ impl ParticleFilter {
         const BEAMS: usize = 800;
         /// Scale of the robust kernel for particles that are a metre off [m].
         const WIDE_KERNEL_M: f64 = 0.4;
-        /// Last step [m]: 800 beams have a noise of millimetres, by which a few steps more do not end.
-        const WITHIN_M: f64 = 1e-3;
+        /// Tolerance [m]: steps of 800 beams, whose noise is millimetres, do not get below that of the configuration.
+        const TOLERANCE_M: f64 = 1e-3;
         let config = &self.config.proposal;
         let beams = choose_beams(scan, BEAMS, config.road_share, attitude, rng);
-        let registration = config.registration.cautious().within(WITHIN_M);
+        let registration = config.registration.cautious().with_tolerance(TOLERANCE_M);
         let radius_m = self.config.places.radius_m;
         let place = |&seed: &usize| {
             let particle = &self.particles.particles()[seed];

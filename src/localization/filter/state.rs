@@ -33,7 +33,7 @@ pub struct ParticleFilter {
     pub(super) last_motion: Option<LastMotion>,
     /// Time since the previous frame [s].
     pub(super) duration_s: f64,
-    /// Where the registration of the next scan starts; `None` at the prediction.
+    /// Start of the registration of the next scan; the prediction if `None`.
     pub(super) near: Option<Pose3>,
     /// Last known ground below the estimate.
     pub(super) patch: Option<GroundPatch>,
