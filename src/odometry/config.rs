@@ -21,7 +21,8 @@ pub struct OdometryConfig {
     /// Distance between registered points of a scan, in voxels.
     #[default(2.0)]
     pub registration_spacing: f64,
-    /// Radius of the local map, as a share of the range (unitless).
+    /// Radius of the local map, as a share of the range (unitless). Voxels without a new point over a path of ten radii are
+    /// removed, too.
     #[default(2.0)]
     pub map_radius_share: f64,
     /// Nearer points are dropped, such as those on the own car, as a share of the range (unitless).

@@ -198,7 +198,7 @@ impl Observation<'_> {
             let information = at.lidar_from_odom * information * at.rotation;
             let pull = information * (at.lidar_from_odom * offset);
             let sums = &mut equations.other;
-            sums.add_in_space(&factors, in_lidar, (information, pull), weight);
+            sums.add_in_space(&factors, in_lidar, information, pull, weight);
             sums.count(distance_m, weight);
         }
     }
@@ -231,35 +231,39 @@ impl Sums {
         self.right_side -= weight * residual_m * jacobian;
     }
 
-    /// Adds the residual of a point in space, with its information matrix Ω and what that makes of the residual:
-    /// Jᵀ Ω J with J = (m I, t B), where row k of B is q × eₖ.
+    /// Adds a residual r in space with its information matrix Ω and `pull` = Ω r: Jᵀ Ω J and −Jᵀ Ω r, where J = (m I, t B) and
+    /// row k of B is q × eₖ.
     fn add_in_space(
         &mut self,
         factors: &Factors,
         point: DVec3,
-        (information, pull): (DMat3, DVec3),
+        information: DMat3,
+        pull: DVec3,
         weight: f64,
     ) {
-        let transposed = DMat3::from_cols(
+        let b_transposed = DMat3::from_cols(
             point.cross(DVec3::X),
             point.cross(DVec3::Y),
             point.cross(DVec3::Z),
         );
         let Factors { moved, turned } = *factors;
-        let beside = information * transposed.transpose();
-        let of_shift = information * (weight * moved * moved);
-        let mixed = beside * (weight * moved * turned);
-        let of_turn = transposed * beside * (weight * turned * turned);
+        let information_b = information * b_transposed.transpose();
+        let shift_block = information * (weight * moved * moved);
+        let mixed_block = information_b * (weight * moved * turned);
+        let turn_block = b_transposed * information_b * (weight * turned * turned);
         let sum = &mut self.information;
         for column in 0..3 {
             for row in 0..3 {
-                sum[(row, column)] += of_shift.col(column)[row];
-                sum[(row, column + 3)] += mixed.col(column)[row];
-                sum[(column + 3, row)] += mixed.col(column)[row];
-                sum[(row + 3, column + 3)] += of_turn.col(column)[row];
+                sum[(row, column)] += shift_block.col(column)[row];
+                sum[(row, column + 3)] += mixed_block.col(column)[row];
+                sum[(column + 3, row)] += mixed_block.col(column)[row];
+                sum[(row + 3, column + 3)] += turn_block.col(column)[row];
             }
         }
-        let (shift, turn) = (weight * moved * pull, weight * turned * (transposed * pull));
+        let (shift, turn) = (
+            weight * moved * pull,
+            weight * turned * (b_transposed * pull),
+        );
         self.right_side -= Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z);
     }
 
@@ -382,14 +386,14 @@ mod tests {
         };
         let (point, offset) = (DVec3::new(7.0, -4.0, 1.5), DVec3::new(0.02, 0.05, -0.03));
         let axes = DMat3::from_quat(DQuat::from_rotation_z(0.6) * DQuat::from_rotation_x(-0.9));
-        let variances = DVec3::new(0.9, 0.3, 0.01);
-        let information = axes * DMat3::from_diagonal(variances) * axes.transpose();
+        let eigenvalues = DVec3::new(0.9, 0.3, 0.01);
+        let information = axes * DMat3::from_diagonal(eigenvalues) * axes.transpose();
         let (mut in_space, mut along_axes) = (Sums::default(), Sums::default());
-        in_space.add_in_space(&factors, point, (information, information * offset), 0.7);
+        in_space.add_in_space(&factors, point, information, information * offset, 0.7);
         for axis in 0..3 {
             let normal = axes.col(axis);
             let jacobian = factors.jacobian(normal, point);
-            along_axes.add(&jacobian, normal.dot(offset), 0.7 * variances[axis]);
+            along_axes.add(&jacobian, normal.dot(offset), 0.7 * eigenvalues[axis]);
         }
         let within = |a: f64, b: f64| (a - b).abs() < 1e-9;
         assert!(

@@ -5,7 +5,8 @@
 //! ```
 //!
 //! A block of eight voxels moves with the point in steps of one voxel, so a point is never farther than half a
-//! voxel from the middle of its block. The finest block whose points form a plane is the surface near the
+//! voxel from the middle of its block. Voxels far from the sensor, and those that got no point over a long path, are
+//! removed. The finest block whose points form a plane is the surface near the
 //! point: variances λ₀ ≪ λ₁, and λ₁ not ≪ λ₂, as it would be on a single ring.
 
 use foldhash::HashMap;
@@ -120,10 +121,11 @@ pub enum Shape {
 pub struct VoxelMap {
     levels: [VoxelGrid; 3],
     point_limit: f32,
-    /// Where the sensor was last, and the length of its path until there [m].
+    /// Last position of the sensor.
     sensor: Option<DVec3>,
+    /// Length of its path [m].
     path_m: f64,
-    /// That length at which voxels were removed last [m].
+    /// Length of its path when voxels were last removed [m].
     removed_at_m: Option<f64>,
 }
 
@@ -174,12 +176,13 @@ impl VoxelMap {
         means.into_iter().map(|(_, mean)| mean).collect()
     }
 
-    /// Moves the sensor: removes voxels that are farther than `radius_m` from it, and those that got no point over a path of ten
-    /// times that length, which returns without the errors of what was seen before. Without that, the map of a car that stays in
-    /// one place would grow as long as it drives.
+    /// Moves the sensor. Removes voxels farther than `radius_m` from it, and voxels that got no point while it moved by ten
+    /// radii: they have the drift of the odometry since then, and with them the map of a car that stays in one area would grow
+    /// without limit. Voxels are checked every 0.02 radii of the path.
     pub fn move_sensor(&mut self, to: DVec3, radius_m: f64) {
+        /// Path after which a voxel without a new point is removed, in radii.
         const PATH_IN_RADII: f64 = 10.0;
-        /// Path after which voxels are looked at again, in radii.
+        /// Path between two checks, in radii.
         const STEP: f64 = 0.02;
         self.path_m += self.sensor.replace(to).map_or(0.0, |it| it.distance(to));
         if (self.removed_at_m).is_some_and(|at_m| self.path_m - at_m < STEP * radius_m) {
@@ -348,6 +351,22 @@ mod tests {
     }
 
     #[test]
+    fn a_surface_is_that_of_the_points_in_all_eight_voxels_of_a_block() {
+        // Blocks that begin in either half of a brick, on both sides of the origin.
+        for index in 0..64 {
+            let block = IVec3::new(index % 4, index / 4 % 4, index / 16) - 2;
+            let middle = (block + IVec3::ONE).as_dvec3();
+            let corner = |place| (offset_of(place).as_dvec3() - 0.5) * DVec3::new(1.0, 0.8, 0.6);
+            let points: Vec<DVec3> = (0..8).map(|place| middle + corner(place)).collect();
+            let mut map = VoxelMap::new(1.0, 50.0);
+            map.insert(&points);
+            let found = map.surface(middle).unwrap();
+            assert!(found.center.distance(middle) < 1e-6, "{block}");
+            assert!(matches!(found.shape, Shape::Other(_)));
+        }
+    }
+
+    #[test]
     fn a_full_voxel_forgets_and_keeps_its_mean() {
         let mut cell = Moments::default();
         for _ in 0..100 {
@@ -367,6 +386,8 @@ mod tests {
         map.insert(&points);
         map.move_sensor(points[0], 1.0);
         assert!(map.surface(points[0]).is_some() && map.surface(points[1599]).is_none());
+        let mut map = VoxelMap::new(0.5, 50.0);
+        map.insert(&points);
         map.move_sensor(DVec3::ZERO, 1.0);
         assert!(map.means().is_empty());
     }
