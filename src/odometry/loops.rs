@@ -399,8 +399,8 @@ mod tests {
             let sine = ((61 * map + sector) as f64 * 12.9898).sin().abs();
             (1e4 * sine) as usize % 20
         };
-        // The eighth submap looks like the one before it but for every other pole, and like the first one, which it is
-        // turned by 30 and 42 degrees to.
+        // Submap 8 looks like submap 7, turned by 30 degrees, except for every other pole, and like submap 1, turned by 42
+        // degrees.
         let of_second = |sector: usize| random(1, (sector + 7) % 60);
         let points: Vec<Vec<TimedPoint>> = (0..16)
             .map(|map| match map {
@@ -442,7 +442,7 @@ mod tests {
         // visits.
         assert_eq!(candidates(1.0, 0.2, 2), [(0, 0.0), (1, 42.0)]);
         assert_eq!(candidates(1.0, 0.2, 0), [(0, 0.0)]);
-        // Two metres and the drift, or 7.5 m and 8 m without it.
+        // With the drift of 1.9 m, 2 m and 7.5 m are too little, 8.25 m are enough.
         assert_eq!(candidates(1.0, 0.04, 2), [(0, 0.0)]);
         assert_eq!(candidates(1.0, 0.15, 2), [(0, 0.0)]);
         assert_eq!(candidates(1.0, 0.165, 2), [(0, 0.0), (1, 42.0)]);

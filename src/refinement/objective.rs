@@ -193,8 +193,8 @@ mod tests {
             let found = objective.on_best_level(&pose).unwrap().level_m.unwrap();
             assert!((found - level_m).abs() < 0.01, "{found}");
             // Next to the deck there is one level.
-            let beside = objective.on_best_level(&Pose2::translation(20.0, 0.0));
-            assert!(beside.unwrap().level_m.unwrap().abs() < 0.01);
+            let next_to_deck = objective.on_best_level(&Pose2::translation(20.0, 0.0));
+            assert!(next_to_deck.unwrap().level_m.unwrap().abs() < 0.01);
         }
     }
 

@@ -396,10 +396,10 @@ mod tests {
         };
         let Ok(_) = minimize(&[wide], &config, batch, &mut StdRng::seed_from_u64(3));
         assert_eq!(positions.len(), 5);
-        for candidate in 0..8 {
-            let moved = |iteration: usize| {
-                positions[iteration + 1][candidate] - positions[iteration][candidate]
-            };
+        let path_of =
+            |candidate: usize| -> Vec<f64> { positions.iter().map(|it| it[candidate]).collect() };
+        for path in (0..8).map(path_of) {
+            let moved = |iteration: usize| path[iteration + 1] - path[iteration];
             // At first up to 0.3 of the reach.
             let first = moved(0) / 0.9;
             assert!(first.abs() <= 300.0 && first.abs() > 0.1, "{first}");

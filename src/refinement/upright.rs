@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn distances_are_those_of_a_raster_transform_within_a_cell() {
+    fn distances_between_cells_are_those_of_steps_to_eight_neighbours_up_to_the_limit() {
         let mut field = DistanceField::empty(Vector2::new(3.0, -2.0), 4.0, 2.5);
         let occupied = [(1.7, -3.9), (4.1, -0.3)];
         occupied.iter().for_each(|&(x, y)| field.occupy(x, y));

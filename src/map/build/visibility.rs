@@ -502,7 +502,7 @@ mod tests {
         let model = model();
         let projection = Projection::of(&model);
         let mut scan = scan(&wall(), Vec3::ZERO);
-        // Half a metre and two percent of the range of the point, or a third of a metre on either side.
+        // Through: more than 0.5 m and 2 % of the range of the point behind it. Seen: less than 0.3 m from it.
         for (range_m, free_m, expected) in [
             (10.0, 10.65, "unknown"),
             (10.0, 10.75, "through"),
