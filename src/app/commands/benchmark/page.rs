@@ -67,8 +67,14 @@ pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Resul
     };
     Ok(Page {
         title: format!("Benchmark on {}", report.recording.display()),
-        verdict: report.localization.verdict(),
+        verdict: (report.localization_aligned.as_ref())
+            .unwrap_or(&report.localization)
+            .verdict(),
         subtitle: match &report.second {
+            Some(second) if report.localization_aligned.is_some() => format!(
+                "{} localized in its map; errors after a rigid alignment.",
+                second.display()
+            ),
             Some(second) => format!("{} localized in its map.", second.display()),
             None => "Every other scan localized in the map of the others.".to_owned(),
         },
