@@ -72,30 +72,11 @@ impl Moments {
     }
 }
 
-/// Voxels of one scale, eight in a brick, so that those around a point need few searches.
+/// Voxels of one scale.
 #[derive(Clone, Debug)]
 struct VoxelGrid {
     edge_m: f64,
-    bricks: HashMap<u64, Brick>,
-}
-
-/// Moments of the voxels of a brick; those of an empty one are zero.
-type Brick = [Moments; 8];
-
-/// The brick of a voxel, and its place in it.
-fn place_of(cell: IVec3) -> (IVec3, usize) {
-    (cell >> 1, place_at(cell & 1))
-}
-
-/// Place in a brick of the voxel at an offset of 0 or 1 voxels from its corner, per axis.
-fn place_at(offset: IVec3) -> usize {
-    (offset.x | offset.y << 1 | offset.z << 2) as usize
-}
-
-/// Offset of a voxel from the corner of its brick [voxels].
-fn offset_of(place: usize) -> IVec3 {
-    let place = place as i32;
-    IVec3::new(place & 1, (place >> 1) & 1, place >> 2)
+    cells: HashMap<u64, Moments>,
 }
 
 /// The surface near a point.
@@ -134,7 +115,7 @@ impl VoxelMap {
     pub fn new(edge_m: f64, point_limit: f32) -> Self {
         let level = |scale: f64| VoxelGrid {
             edge_m: edge_m * scale,
-            bricks: HashMap::default(),
+            cells: HashMap::default(),
         };
         Self {
             levels: [level(1.0), level(2.0), level(4.0)],
@@ -152,8 +133,7 @@ impl VoxelMap {
             for &point in points {
                 let cell = cell_of(point / level.edge_m);
                 let offset = (point - cell.as_dvec3() * level.edge_m).as_vec3();
-                let (brick, place) = place_of(cell);
-                let moments = &mut level.bricks.entry(pack(brick)).or_default()[place];
+                let moments = level.cells.entry(pack(cell)).or_default();
                 moments.add(offset, point_limit);
                 moments.added_at_m = path_m;
             }
@@ -163,17 +143,13 @@ impl VoxelMap {
     /// The means of the finest voxels, in a fixed order.
     pub fn means(&self) -> Vec<DVec3> {
         let level = &self.levels[0];
-        let mut means: Vec<(u64, DVec3)> = (level.bricks.iter())
-            .flat_map(|(&key, brick)| (brick.iter().enumerate()).map(move |it| (key, it)))
-            .filter(|(_, (_, moments))| moments.count > 0.0)
-            .map(|(key, (place, moments))| {
-                let cell = unpack(key) * 2 + offset_of(place);
-                let offset = (moments.first / moments.count).as_dvec3();
-                (pack(cell), cell.as_dvec3() * level.edge_m + offset)
-            })
-            .collect();
-        means.sort_unstable_by_key(|&(key, _)| key);
-        means.into_iter().map(|(_, mean)| mean).collect()
+        let mut keys: Vec<u64> = level.cells.keys().copied().collect();
+        keys.sort_unstable();
+        let mean = |key: u64| {
+            let cell = &level.cells[&key];
+            unpack(key).as_dvec3() * level.edge_m + (cell.first / cell.count).as_dvec3()
+        };
+        keys.into_iter().map(mean).collect()
     }
 
     /// Moves the sensor. Removes voxels farther than `radius_m` from it, and voxels that got no point while it moved by ten
@@ -192,19 +168,9 @@ impl VoxelMap {
         let oldest_m = (self.path_m - PATH_IN_RADII * radius_m) as f32;
         self.levels.par_iter_mut().for_each(|level| {
             let edge_m = level.edge_m;
-            level.bricks.retain(|&key, brick| {
-                let corner = unpack(key) * 2;
-                let mut is_empty = true;
-                for (place, moments) in brick.iter_mut().enumerate() {
-                    let at = (corner + offset_of(place)).as_dvec3() * edge_m;
-                    if at.distance_squared(to) > radius_m * radius_m
-                        || moments.added_at_m < oldest_m
-                    {
-                        *moments = Moments::default();
-                    }
-                    is_empty &= moments.count == 0.0;
-                }
-                !is_empty
+            level.cells.retain(|&key, cell| {
+                let corner = unpack(key).as_dvec3() * edge_m;
+                corner.distance_squared(to) <= radius_m * radius_m && cell.added_at_m >= oldest_m
             });
         });
     }
@@ -251,22 +217,11 @@ impl VoxelGrid {
         let block = self.block(point);
         let edge_m = self.edge_m as f32;
         let mut sums = Moments::default();
-        let mut bricks: [Option<&Brick>; 8] = [None; 8];
-        // Along an axis the block is in two bricks where it begins in the second half of one.
-        let is_split = place_at(block & 1);
-        for split in (0..8).filter(|split| split & !is_split == 0) {
-            let brick = (block >> 1) + offset_of(split);
-            bricks[split] = self.bricks.get(&pack(brick));
-        }
         for corner in 0..8 {
-            let step = offset_of(corner);
-            let Some(brick) = bricks[corner & is_split] else {
-                continue;
-            };
-            let moments = &brick[place_of(block + step).1];
-            if moments.count > 0.0 {
+            let step = IVec3::new(corner & 1, (corner >> 1) & 1, corner >> 2);
+            if let Some(cell) = self.cells.get(&pack(block + step)) {
                 // Relative to the middle of the block.
-                sums.merge(moments, (step - IVec3::ONE).as_vec3() * edge_m);
+                sums.merge(cell, (step - IVec3::ONE).as_vec3() * edge_m);
             }
         }
         if sums.count < MIN_POINTS {
@@ -352,11 +307,12 @@ mod tests {
 
     #[test]
     fn a_surface_is_that_of_the_points_in_all_eight_voxels_of_a_block() {
-        // Blocks that begin in either half of a brick, on both sides of the origin.
+        // Blocks on both sides of the origin.
         for index in 0..64 {
             let block = IVec3::new(index % 4, index / 4 % 4, index / 16) - 2;
             let middle = (block + IVec3::ONE).as_dvec3();
-            let corner = |place| (offset_of(place).as_dvec3() - 0.5) * DVec3::new(1.0, 0.8, 0.6);
+            let sides = |place: i32| IVec3::new(place & 1, (place >> 1) & 1, place >> 2).as_dvec3();
+            let corner = |place| (sides(place) - 0.5) * DVec3::new(1.0, 0.8, 0.6);
             let points: Vec<DVec3> = (0..8).map(|place| middle + corner(place)).collect();
             let mut map = VoxelMap::new(1.0, 50.0);
             map.insert(&points);
