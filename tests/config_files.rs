@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use fpmcl::internals::app::ComparisonConfig;
 use fpmcl::internals::app::settings::{
-    self, BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, Initialization,
+    BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, Initialization,
     LocalizationConfig, MapInputConfig, OdometryCommandConfig, PoseInputConfig, RecordingConfig,
     RefinementConfig,
 };
@@ -22,7 +22,7 @@ fn root() -> &'static Path {
 }
 
 fn load<T: CommandConfig>(path: &Path) -> T {
-    settings::load(Some(path), &[]).unwrap_or_else(|error| panic!("{error}"))
+    T::load(Some(path), &[]).unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// Loads a configuration from a text.
@@ -74,7 +74,7 @@ fn round_trip<T: CommandConfig + PartialEq + Debug>(path: &Path) {
     let config: T = load(path);
     let folder = tempfile::tempdir().unwrap();
     let effective = folder.path().join("effective.yml");
-    std::fs::write(&effective, settings::to_yaml(&config).unwrap()).unwrap();
+    std::fs::write(&effective, config.to_yaml().unwrap()).unwrap();
     assert_eq!(load::<T>(&effective), config, "{}", path.display());
 }
 
@@ -97,14 +97,14 @@ fn require_comments(name: &str, text: &str) {
 
 /// Checks the texts of a command: both have the defaults, the full one every key, the short one few.
 fn check_texts<T: CommandConfig + PartialEq + Debug>() {
-    let full = settings::full_text::<T>().unwrap();
+    let full = T::full_text().unwrap();
     assert_eq!(parse::<T>(&full), T::default(), "{}", T::PATH);
     assert_eq!(parse::<T>(T::SHORT), T::default(), "{}", T::PATH);
     let keys_of = |text: &str| -> Vec<String> {
         let keys = text.lines().filter_map(key_of);
         keys.map(str::to_owned).collect()
     };
-    let effective = settings::to_yaml(&T::default()).unwrap();
+    let effective = T::default().to_yaml().unwrap();
     assert_eq!(keys_of(&full), keys_of(&effective), "{}", T::PATH);
     require_comments(T::PATH, &full);
     require_comments(T::PATH, T::SHORT);

@@ -11,7 +11,7 @@ use std::process::Command as Process;
 
 use clap::{CommandFactory as _, Parser as _};
 use fpmcl::internals::app::settings::{
-    self, BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
+    BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
     OdometryCommandConfig, RefinementConfig,
 };
 use fpmcl::internals::app::{Cli, Command, ComparisonConfig};
@@ -77,7 +77,7 @@ fn code(text: &str) -> Vec<String> {
 fn unknown<T: CommandConfig>(settings: &[(String, String)]) -> Vec<String> {
     let is_unknown = |(key, value): &&(String, String)| {
         let setting = [(key.clone(), value.clone())];
-        settings::with_settings(T::default(), &setting).is_err_and(|error| {
+        T::default().with_settings(&setting).is_err_and(|error| {
             let message = error.to_string();
             ["unknown key", "not a key any more", "is ambiguous"]
                 .iter()

@@ -25,7 +25,7 @@ use fpmcl::internals::FARTHEST_M;
 use fpmcl::internals::app::ComparisonConfig;
 use fpmcl::internals::app::LocalizationResults;
 use fpmcl::internals::app::settings::{
-    self, BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
+    BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
     RefinementConfig,
 };
 use fpmcl::internals::app::{Cli, Command};
@@ -501,16 +501,16 @@ fn configurations() {
 }
 
 fn read_config<T: CommandConfig + PartialEq>(file: &Input) -> Result<(), String> {
-    let config: T = settings::load(Some(file.path), &[]).map_err(text)?;
+    let config: T = T::load(Some(file.path), &[]).map_err(text)?;
     check_config(&config, file);
     Ok(())
 }
 
 /// Checks that a configuration reads back as it is written; no number equals itself that is none.
 fn check_config<T: CommandConfig + PartialEq>(config: &T, file: &Input) {
-    let written = settings::to_yaml(config).unwrap();
+    let written = config.to_yaml().unwrap();
     let path = file.write_beside(written.as_bytes());
-    let again: T = settings::load(Some(&path), &[]).unwrap_or_else(|e| panic!("{e}: {written}"));
+    let again: T = T::load(Some(&path), &[]).unwrap_or_else(|e| panic!("{e}: {written}"));
     assert!(*config == again, "{written}");
 }
 
@@ -565,7 +565,7 @@ fn set<'a, T: CommandConfig + PartialEq>(
         Command::Ground(args) => args.settings,
         other => panic!("{other:?} has no settings"),
     };
-    let config = settings::with_settings(T::default(), &settings).map_err(text)?;
+    let config = T::default().with_settings(&settings).map_err(text)?;
     check_config(&config, file);
     Ok(())
 }

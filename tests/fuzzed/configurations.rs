@@ -6,7 +6,7 @@ use arbtest::arbitrary::{Result, Unstructured};
 use fpmcl::internals::app::ComparisonConfig;
 use fpmcl::internals::app::settings::{
     BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
-    RefinementConfig, to_yaml,
+    RefinementConfig,
 };
 use fpmcl::simulation::SimulationConfig;
 
@@ -37,7 +37,7 @@ static DEFAULTS: LazyLock<[Defaults; COMMANDS]> = LazyLock::new(|| {
 });
 
 fn defaults<T: CommandConfig>() -> Defaults {
-    let text = to_yaml(&T::default()).unwrap();
+    let text = T::default().to_yaml().unwrap();
     let mut blocks: Vec<String> = Vec::new();
     let mut keys = Vec::new();
     let mut path: Vec<(usize, &str)> = Vec::new();

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::app::run::arguments::yaml;
-use crate::app::settings::{CommandConfig, require_path};
+use crate::app::settings::{command_configs, require_path};
 use crate::file_path::FilePath;
 use crate::validation::{InvalidValue, Validate, at_least_one, require};
 
@@ -39,10 +39,7 @@ pub struct ComparisonConfig {
     pub particles: Option<ParticleSweep>,
 }
 
-impl CommandConfig for ComparisonConfig {
-    const PATH: &'static str = "config/comparison.yml";
-    const SHORT: &'static str = include_str!("../../../config/comparison.yml");
-}
+command_configs!(ComparisonConfig: "comparison");
 
 /// Overrides of the defaults of the stages.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -11,23 +11,59 @@ use super::refinement::RefinementConfig;
 use crate::configuration::{self, ConfigError, Configuration, Settings, commented};
 use crate::simulation::SimulationConfig;
 
-/// The configuration of a command.
+/// The configuration of a command. The functions are compiled with the library, and not again wherever they are used.
 pub trait CommandConfig: Configuration {
     /// Path of the file that is used if it exists and no other is given.
     const PATH: &'static str;
     /// The keys that people change; the configuration where there is no file.
     const SHORT: &'static str;
+
+    /// See [`load`].
+    fn load(path: Option<&Path>, settings: &[(String, String)]) -> Result<Self, ConfigError>;
+
+    /// See [`with_settings`].
+    fn with_settings(self, settings: &[(String, String)]) -> Result<Self, ConfigError>;
+
+    /// See [`full_text`].
+    fn full_text() -> Result<String, ConfigError>;
+
+    /// All keys with their values.
+    fn to_yaml(&self) -> Result<String, ConfigError>;
 }
 
 /// Names the files of configurations, which are below `config/`.
 macro_rules! command_configs {
     ($($config:ty: $name:literal),* $(,)?) => {
-        $(impl CommandConfig for $config {
+        $(impl $crate::app::settings::CommandConfig for $config {
             const PATH: &'static str = concat!("config/", $name, ".yml");
-            const SHORT: &'static str = include_str!(concat!("../../../config/", $name, ".yml"));
+            const SHORT: &'static str =
+                include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/config/", $name, ".yml"));
+
+            fn load(
+                path: Option<&std::path::Path>,
+                settings: &[(String, String)],
+            ) -> Result<Self, $crate::app::settings::ConfigError> {
+                $crate::app::settings::load(path, settings)
+            }
+
+            fn with_settings(
+                self,
+                settings: &[(String, String)],
+            ) -> Result<Self, $crate::app::settings::ConfigError> {
+                $crate::app::settings::with_settings(self, settings)
+            }
+
+            fn full_text() -> Result<String, $crate::app::settings::ConfigError> {
+                $crate::app::settings::full_text::<Self>()
+            }
+
+            fn to_yaml(&self) -> Result<String, $crate::app::settings::ConfigError> {
+                Ok($crate::app::settings::to_yaml(self)?)
+            }
         })*
     };
 }
+pub(crate) use command_configs;
 
 command_configs!(
     BuildMapConfig: "build_map",

@@ -28,6 +28,7 @@ pub use blocks::{
 pub use build_map::BuildMapConfig;
 pub use evaluation::EvaluationConfig;
 pub use ground::GroundCommandConfig;
+pub(crate) use load::command_configs;
 pub use load::{CommandConfig, full_text, load, with_settings};
 pub use localization::{Initialization, LocalizationConfig, MotionModel};
 pub use odometry::OdometryCommandConfig;
