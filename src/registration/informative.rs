@@ -20,26 +20,25 @@ use super::config::RegistrationConfig;
 use super::information::{Horizontal, Residual};
 use crate::geometry::RobustKernel;
 
-/// The numbers of about `count` beams in their order; those of all residuals if these are fewer, or do not determine the pose.
+/// The residuals of about `count` beams in their order; all of them if these are fewer, or do not determine the pose.
 pub(super) fn choose(
-    residuals: &[Residual],
+    mut residuals: Vec<Residual>,
     count: usize,
     config: &RegistrationConfig,
-) -> Vec<usize> {
+) -> Vec<Residual> {
     const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
     let shares = (residuals.len() > count)
-        .then(|| shares(residuals, count, config))
+        .then(|| shares(&residuals, count, config))
         .flatten();
-    let Some(shares) = shares else {
-        return residuals.iter().map(|residual| residual.beam).collect();
-    };
-    // Multiples of the golden ratio are spread most evenly, and whether a beam is drawn hardly depends on the others.
-    let is_drawn = |(residual, share): (&Residual, &f64)| {
-        ((residual.beam as f64 * GOLDEN_RATIO).fract() < *share).then_some(residual.beam)
-    };
-    (residuals.iter().zip(&shares))
-        .filter_map(is_drawn)
-        .collect()
+    if let Some(shares) = shares {
+        let mut shares = shares.into_iter();
+        // Multiples of the golden ratio are spread most evenly, and whether a beam is drawn hardly depends on the others.
+        residuals.retain(|residual| {
+            let share = shares.next().unwrap_or_default();
+            (residual.beam as f64 * GOLDEN_RATIO).fract() < share
+        });
+    }
+    residuals
 }
 
 /// Probabilities of the residuals, whose sum is about `count`; `None` if all of them do not determine the pose.
@@ -113,6 +112,10 @@ mod tests {
             .collect()
     }
 
+    fn beams_of(residuals: &[Residual]) -> Vec<usize> {
+        residuals.iter().map(|residual| residual.beam).collect()
+    }
+
     fn poles(chosen: &[usize]) -> usize {
         chosen.iter().filter(|beam| *beam % 100 == 7).count()
     }
@@ -134,7 +137,7 @@ mod tests {
 
     #[test]
     fn all_that_few_beams_show_is_kept_and_the_rest_is_drawn_uniformly() {
-        let chosen = choose(&street(0.0), 3000, &exact_normals());
+        let chosen = beams_of(&choose(street(0.0), 3000, &exact_normals()));
         assert!((2900..=3100).contains(&chosen.len()), "{}", chosen.len());
         assert!(chosen.is_sorted());
         // All 60 poles, where every other beam would have had 30.
@@ -156,7 +159,7 @@ mod tests {
     #[test]
     fn few_residuals_are_all_taken() {
         let few: Vec<Residual> = street(0.0).into_iter().step_by(3).collect();
-        let chosen = choose(&few, 3000, &RegistrationConfig::default());
+        let chosen = beams_of(&choose(few, 3000, &RegistrationConfig::default()));
         assert!(chosen.iter().copied().eq((0..6000).step_by(3)));
     }
 }

@@ -43,7 +43,7 @@ use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
 
 /// Tolerance of a registration that another one continues [m].
-const NEAR_M: f64 = 0.01;
+const COARSE_TOLERANCE_M: f64 = 0.01;
 
 /// A registered pose with its covariance.
 #[derive(Clone, Debug, PartialEq)]
@@ -152,12 +152,18 @@ pub(crate) fn register_informative(
     }
     let step = beams.len().div_ceil(COARSE);
     let some: Vec<Beam> = beams.iter().step_by(step).copied().collect();
-    let near = register(renderer, &some, initial, &config.with_tolerance(NEAR_M))?;
+    let near = register(
+        renderer,
+        &some,
+        initial,
+        &config.with_tolerance(COARSE_TOLERANCE_M),
+    )?;
     let near = near.map_or(*initial, |near| near.map_from_lidar);
-    let mut residuals = linearize(renderer, beams, &near, config)?;
-    let chosen = informative::choose(&residuals, FINE, config);
-    residuals.retain(|residual| chosen.binary_search(&residual.beam).is_ok());
-    let chosen: Vec<Beam> = chosen.iter().map(|&beam| beams[beam]).collect();
+    let residuals = linearize(renderer, beams, &near, config)?;
+    let residuals = informative::choose(residuals, FINE, config);
+    let chosen: Vec<Beam> = (residuals.iter())
+        .map(|residual| beams[residual.beam])
+        .collect();
     descend(renderer, &chosen, near, residuals, config)
 }
 
@@ -173,7 +179,7 @@ pub(crate) fn register_coarse_to_fine(
 ) -> Result<Option<RegistrationResult>, RenderError> {
     let wide = RegistrationConfig {
         kernel_m: config.kernel_m.max(wide_kernel_m),
-        ..config.with_tolerance(NEAR_M)
+        ..config.with_tolerance(COARSE_TOLERANCE_M)
     };
     let (mut pose, mut result) = (*initial, None);
     for (beams, config) in beams.into_iter().zip([&wide, config]) {
