@@ -10,7 +10,7 @@ use super::preparation::ScanPreparation;
 use super::sweep::SweepMotion;
 use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::lidar::{RangeImage, Scan};
+use crate::lidar::{Motion, RangeImage, Scan};
 use crate::map::{Map, PanoramaRequest, SearchRegion, SensorAttitude};
 use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
@@ -165,9 +165,10 @@ impl Localizer {
             Odometry::Motion(motion) => before.map(|_| self.attitude.after(&motion)),
             _ => before,
         };
-        let near = self.registered(scan, odometry, known, duration_s, &mut rng)?;
-        let motion = near.and_then(|pose| self.sweep.around(&pose, duration_s));
-        let motion = motion.or(self.sweep.predict(odometry, duration_s));
+        let predicted = self.sweep.predict(odometry, duration_s);
+        let near = self.registered(scan, odometry, known, predicted.as_ref(), &mut rng)?;
+        let found = near.and_then(|pose| self.sweep.around(&pose, duration_s));
+        let motion = found.or(predicted);
         let image = self.preparation.range_image(scan, motion.as_ref());
         if let Some(attitude) = known.or_else(|| self.preparation.attitude(&image)) {
             self.attitude = attitude;
@@ -181,7 +182,7 @@ impl Localizer {
         };
         let filter = self.filter.insert(filter);
         filter.set_duration_s(duration_s);
-        filter.set_near(near);
+        filter.set_registration_start(near);
         let mut estimate = filter.step(odometry, &image, &self.attitude, &mut rng)?;
         if let Some(found) = filter.attitude().filter(|found| Some(*found) != before) {
             self.attitude = found;
@@ -200,7 +201,7 @@ impl Localizer {
         scan: &Scan,
         odometry: Odometry,
         attitude: Option<SensorAttitude>,
-        duration_s: f64,
+        predicted: Option<&Motion>,
         rng: &mut Generator,
     ) -> Result<Option<Pose3>, LocalizerError> {
         /// Every n-th point is registered; beams are not numbered in multiples of it.
@@ -209,9 +210,8 @@ impl Localizer {
         let Some((filter, attitude)) = filter.zip(attitude) else {
             return Ok(None);
         };
-        let predicted = self.sweep.predict(odometry, duration_s);
         let some = scan.every(STEP);
-        let image = self.preparation.range_image(&some, predicted.as_ref());
+        let image = self.preparation.range_image(&some, predicted);
         Ok(filter.registered(odometry, &image, &attitude, rng)?)
     }
 

@@ -67,14 +67,13 @@ impl ParticleFilter {
         }
     }
 
-    /// Registers the scan with the map, from a pose near its own if that is plausible, else from the prediction, and fuses the
-    /// result with the prediction; `None` while the distribution is wide, where registration fails, and where its result is
-    /// implausible.
+    /// Registers the scan with the map, from `start` if that is plausible, else from the prediction, and fuses the result with the
+    /// prediction; `None` while the distribution is wide, where registration fails, and where its result is implausible.
     pub(super) fn propose(
         &self,
         scan: &RangeImage,
         attitude: &SensorAttitude,
-        near: Option<Pose3>,
+        start: Option<Pose3>,
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
         let config = &self.config.proposal;
@@ -92,8 +91,9 @@ impl ParticleFilter {
             return Ok(None);
         };
         let is_plausible = |pose: &Pose2| prior.squared_distance(pose) <= MAX_SIGMAS.powi(2);
-        let near = near.filter(|near| is_plausible(&pose2_from_pose3(near)));
-        let start = near.unwrap_or_else(|| patch.lift(&mean, attitude));
+        let start = start
+            .filter(|start| is_plausible(&pose2_from_pose3(start)))
+            .unwrap_or_else(|| patch.lift(&mean, attitude));
         let renderer = &*self.map.renderer;
         let registration = self.registration();
         let Some(found) = register_informative(renderer, &registered, &start, &registration)?
@@ -207,13 +207,13 @@ mod tests {
         let truth = world.pose_at(12.0, 0.2, 0.05);
         let attitude = SensorAttitude::default();
         let at_truth = world.ground.lift(&truth, &attitude).unwrap();
-        let error_m = |mean: Pose2, sigma_m: f64, near: Option<Pose3>| {
+        let error_m = |mean: Pose2, sigma_m: f64, start: Option<Pose3>| {
             let mut rng = StdRng::seed_from_u64(1);
             let sigmas = Vector3::new(sigma_m, sigma_m, 0.01);
             let covariance = nalgebra::Matrix3::from_diagonal(&sigmas.component_mul(&sigmas));
             let prior = Gaussian::new(mean, covariance).unwrap();
             let filter = tracking(&world, &prior, &mut rng);
-            let found = filter.propose(&world.scan(&truth), &attitude, near, &mut rng);
+            let found = filter.propose(&world.scan(&truth), &attitude, start, &mut rng);
             let off = |found: Posterior| deviation(&found.gaussian.mean, &truth).xy().norm();
             found.unwrap().map_or(f64::INFINITY, off)
         };
@@ -221,7 +221,7 @@ mod tests {
         let aside = truth * Pose2::translation(0.0, 1.5);
         assert!(error_m(aside, 1.0, at_truth) < 0.01);
         assert!(error_m(aside, 1.0, None) > 0.1);
-        // The given pose is, by 15 standard deviations.
+        // The given start is off, by 15 standard deviations.
         let off = world.ground.lift(&aside, &attitude).unwrap();
         assert!(error_m(truth, 0.1, off) < 0.01);
     }

@@ -34,7 +34,7 @@ pub struct ParticleFilter {
     /// Time since the previous frame [s].
     pub(super) duration_s: f64,
     /// Start of the registration of the next scan; the prediction if `None`.
-    pub(super) near: Option<Pose3>,
+    pub(super) registration_start: Option<Pose3>,
     /// Last known ground below the estimate.
     pub(super) patch: Option<GroundPatch>,
     /// Attitude of the sensor in the last update.
@@ -103,7 +103,7 @@ impl ParticleFilter {
             pending: None,
             last_motion: None,
             duration_s: PERIOD_S,
-            near: None,
+            registration_start: None,
             attitude: None,
         })
     }
@@ -113,9 +113,9 @@ impl ParticleFilter {
         self.duration_s = duration_s;
     }
 
-    /// Sets a pose of the next scan, from [`registered`](Self::registered), near which its registration starts.
-    pub fn set_near(&mut self, near: Option<Pose3>) {
-        self.near = near;
+    /// Sets the pose at which the registration of the next scan starts: that of [`registered`](Self::registered).
+    pub fn set_registration_start(&mut self, start: Option<Pose3>) {
+        self.registration_start = start;
     }
 
     /// Attitude of the sensor in the last frame if it is a good start for the next: while tracking it

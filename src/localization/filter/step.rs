@@ -26,7 +26,7 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Estimate, RenderError> {
-        let near = self.near.take();
+        let start = self.registration_start.take();
         self.accumulate(odometry);
         if !self.is_update_due(odometry)
             && let Some(coasted) = self.coast_unless_contradicted(odometry, scan, attitude, rng)?
@@ -34,7 +34,7 @@ impl ParticleFilter {
             return Ok(coasted);
         }
         self.propagate(odometry, rng);
-        let update = match self.propose(scan, attitude, near, rng)? {
+        let update = match self.propose(scan, attitude, start, rng)? {
             Some(posterior) => self.sample(posterior, rng),
             None => self.reweight_widely(scan, attitude, rng)?,
         };
