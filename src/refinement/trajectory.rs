@@ -706,6 +706,20 @@ mod tests {
         Sensor::new(LidarModel::default())
     }
 
+    /// A frame that was refined where the estimate was tracked.
+    fn refined_frame(pose: Pose2, covariance: Matrix3<f64>, state: State) -> FrameResult {
+        let in_space = pose3_from_pose2(&pose, 0.0);
+        FrameResult {
+            pose,
+            map_from_lidar: (state == State::Tracking).then_some(in_space),
+            covariance,
+            state,
+            change: None,
+            attitude: SensorAttitude::default(),
+            level_m: None,
+        }
+    }
+
     #[test]
     fn a_jump_where_tracking_was_lost_does_not_affect_its_neighbors() {
         let map = TestWorld::street().map();
@@ -716,19 +730,12 @@ mod tests {
             let jump_m = if row > 10 { 50.0 } else { 0.0 };
             let pose = Pose2::translation(f64::from(row) + jump_m, 0.0);
             let covariance = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6));
-            refiner.frames.push(FrameResult {
-                pose,
-                map_from_lidar: (!is_lost).then(|| pose3_from_pose2(&pose, 0.0)),
-                covariance,
-                state: if is_lost {
-                    State::Lost
-                } else {
-                    State::Tracking
-                },
-                change: None,
-                attitude: SensorAttitude::default(),
-                level_m: None,
-            });
+            let state = if is_lost {
+                State::Lost
+            } else {
+                State::Tracking
+            };
+            refiner.frames.push(refined_frame(pose, covariance, state));
         }
         let before: Vec<Pose2> = refiner.frames.iter().map(|frame| frame.pose).collect();
         let increments = vec![Pose2::translation(1.0, 0.0); 20];
@@ -864,15 +871,10 @@ mod tests {
             let mut refiner =
                 TrajectoryRefiner::new(&map, &sensor(), RefinerConfig::default(), 0).unwrap();
             for &(x, state) in frames {
-                refiner.frames.push(FrameResult {
-                    pose: Pose2::translation(x, 0.0),
-                    map_from_lidar: None,
-                    covariance: Matrix3::identity(),
-                    state,
-                    change: None,
-                    attitude: SensorAttitude::default(),
-                    level_m: None,
-                });
+                let pose = Pose2::translation(x, 0.0);
+                refiner
+                    .frames
+                    .push(refined_frame(pose, Matrix3::identity(), state));
             }
             refiner.tracked_stretches(&vec![increment; frames.len()])
         };
@@ -915,15 +917,9 @@ mod tests {
             let mut refiner = TrajectoryRefiner::new(&map, &sensor(), config, 0).unwrap();
             for row in 0..20 {
                 let pose = Pose2::translation(f64::from(row), 0.0);
-                refiner.frames.push(FrameResult {
-                    pose,
-                    map_from_lidar: Some(pose3_from_pose2(&pose, 0.0)),
-                    covariance: own + of_map,
-                    state: State::Tracking,
-                    change: None,
-                    attitude: SensorAttitude::default(),
-                    level_m: None,
-                });
+                refiner
+                    .frames
+                    .push(refined_frame(pose, own + of_map, State::Tracking));
             }
             let increments = vec![Pose2::translation(1.0, 0.0); 20];
             refiner.finish(Some(&increments)).unwrap().covariances
@@ -1057,15 +1053,10 @@ mod tests {
         for row in 0..20 {
             let jump_m = if row > 10 { 50.0 } else { 0.0 };
             let pose = Pose2::translation(f64::from(row) + jump_m, 0.0);
-            refiner.frames.push(FrameResult {
-                pose,
-                map_from_lidar: Some(pose3_from_pose2(&pose, 0.0)),
-                covariance: Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6)),
-                state: State::Tracking,
-                change: None,
-                attitude: SensorAttitude::default(),
-                level_m: None,
-            });
+            let covariance = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6));
+            refiner
+                .frames
+                .push(refined_frame(pose, covariance, State::Tracking));
         }
         let before: Vec<Pose2> = refiner.frames.iter().map(|frame| frame.pose).collect();
         let increments = vec![Pose2::translation(1.0, 0.0); 20];
