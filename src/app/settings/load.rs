@@ -11,7 +11,8 @@ use super::refinement::RefinementConfig;
 use crate::configuration::{self, ConfigError, Configuration, Settings, commented};
 use crate::simulation::SimulationConfig;
 
-/// The configuration of a command. The functions are compiled with the library, and not again wherever they are used.
+/// The configuration of a command. Other crates read it by these functions, which are compiled with the library and not again with
+/// each of those crates.
 pub trait CommandConfig: Configuration {
     /// Path of the file that is used if it exists and no other is given.
     const PATH: &'static str;
@@ -76,7 +77,7 @@ command_configs!(
 );
 
 /// Every key of a command with its default and its documentation, below the heading of the short text.
-pub fn full_text<T: CommandConfig>() -> Result<String, ConfigError> {
+pub(crate) fn full_text<T: CommandConfig>() -> Result<String, ConfigError> {
     let heading = T::SHORT.lines().next().unwrap_or_default();
     let keys = commented::<T>()?;
     Ok(format!(
@@ -87,7 +88,7 @@ pub fn full_text<T: CommandConfig>() -> Result<String, ConfigError> {
 /// Loads and validates the configuration of a command from `path`, else from its default path
 /// where that file exists, else from the built-in text, with settings (dotted key, YAML value)
 /// applied in order.
-pub fn load<T: CommandConfig>(
+pub(crate) fn load<T: CommandConfig>(
     path: Option<&Path>,
     settings: &[(String, String)],
 ) -> Result<T, ConfigError> {
@@ -100,7 +101,7 @@ pub fn load<T: CommandConfig>(
 }
 
 /// Applies settings to a configuration and validates it.
-pub fn with_settings<T: Configuration>(
+pub(crate) fn with_settings<T: Configuration>(
     config: T,
     settings: &[(String, String)],
 ) -> Result<T, ConfigError> {

@@ -28,8 +28,8 @@ pub use blocks::{
 pub use build_map::BuildMapConfig;
 pub use evaluation::EvaluationConfig;
 pub use ground::GroundCommandConfig;
-pub(crate) use load::command_configs;
-pub use load::{CommandConfig, full_text, load, with_settings};
+pub use load::CommandConfig;
+pub(crate) use load::{command_configs, full_text, load, with_settings};
 pub use localization::{Initialization, LocalizationConfig, MotionModel};
 pub use odometry::OdometryCommandConfig;
 pub use refinement::RefinementConfig;
