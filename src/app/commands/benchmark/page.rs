@@ -65,17 +65,15 @@ pub fn page(report: &BenchmarkReport, map: &Path, localized: &RunFiles) -> Resul
         title: title.to_owned(),
         elements,
     };
+    let (shown, aligned) = match &report.localization_aligned {
+        Some(aligned) => (aligned, "; errors after a rigid alignment"),
+        None => (&report.localization, ""),
+    };
     Ok(Page {
         title: format!("Benchmark on {}", report.recording.display()),
-        verdict: (report.localization_aligned.as_ref())
-            .unwrap_or(&report.localization)
-            .verdict(),
+        verdict: shown.verdict(),
         subtitle: match &report.second {
-            Some(second) if report.localization_aligned.is_some() => format!(
-                "{} localized in its map; errors after a rigid alignment.",
-                second.display()
-            ),
-            Some(second) => format!("{} localized in its map.", second.display()),
+            Some(second) => format!("{} localized in its map{aligned}.", second.display()),
             None => "Every other scan localized in the map of the others.".to_owned(),
         },
         sections: vec![
