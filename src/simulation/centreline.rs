@@ -1,7 +1,7 @@
 //! Centrelines of roads and lanes: smooth curves in the plane with a height profile.
 //!
-//! Knots every two metres, joined by cubic Hermite curves with Catmull-Rom tangents, so that the
-//! heading is continuous. A *station* is the arc length from the start of the centreline.
+//! Knots every two metres, joined by a natural cubic spline, so that heading and curvature are continuous: a car does not turn
+//! its wheels at once. A *station* is the arc length from the start of the centreline.
 
 use glam::DVec2;
 use serde::{Deserialize, Serialize};
@@ -90,6 +90,8 @@ pub struct Knot {
     pub height_m: f64,
     /// Arc length from the start [m].
     pub station_m: f64,
+    /// Derivative of the position with the station.
+    tangent: DVec2,
 }
 
 /// A smooth curve through at least two knots.
@@ -197,7 +199,7 @@ impl Centreline {
         let [before, after] = [&self.knots[index], &self.knots[index + 1]];
         let span_m = after.station_m - before.station_m;
         let (p, q) = (before.position, after.position);
-        let [dp, dq] = [index, index + 1].map(|knot| span_m * self.tangent(knot));
+        let [dp, dq] = [before, after].map(|knot| span_m * knot.tangent);
         let (t2, t3) = (t * t, t * t * t);
         let position = (2.0 * t3 - 3.0 * t2 + 1.0) * p
             + (t3 - 2.0 * t2 + t) * dp
@@ -222,13 +224,6 @@ impl Centreline {
         let from_m = self.knots[index].station_m;
         let span_m = self.knots[index + 1].station_m - from_m;
         (index, (station_m - from_m) / span_m)
-    }
-
-    /// Catmull-Rom tangent at a knot.
-    fn tangent(&self, index: usize) -> DVec2 {
-        let before = self.knots[index.saturating_sub(1)];
-        let after = self.knots[(index + 1).min(self.knots.len() - 1)];
-        (after.position - before.position) / (after.station_m - before.station_m)
     }
 
     /// The curve through knots that a Gaussian has smoothed.
@@ -273,9 +268,43 @@ impl Centreline {
                 position,
                 height_m,
                 station_m,
+                tangent: DVec2::X,
             });
         }
+        set_tangents(&mut knots);
         Self { knots }
+    }
+}
+
+/// Sets the tangents of at least two knots to those of the natural cubic spline (de Boor, *A Practical Guide to Splines*, 1978,
+/// chapter IV): with h the distance and d the slope between knots,
+///
+/// ```text
+/// t₋ / h₋ + 2 (1 / h₋ + 1 / h₊) t + t₊ / h₊ = 3 (d₋ / h₋ + d₊ / h₊)
+/// ```
+fn set_tangents(knots: &mut [Knot]) {
+    // Inverse distance to the next knot and slope; none beyond the ends.
+    let spans: Vec<(f64, DVec2)> = (knots.windows(2))
+        .map(|ends| {
+            let inverse = 1.0 / (ends[1].station_m - ends[0].station_m);
+            (inverse, inverse * (ends[1].position - ends[0].position))
+        })
+        .chain([(0.0, DVec2::ZERO)])
+        .collect();
+    let (mut before, mut eliminated) = ((0.0, DVec2::ZERO), (0.0, DVec2::ZERO));
+    // Gaussian elimination downwards, then substitution upwards.
+    let mut shares = Vec::with_capacity(knots.len());
+    for (knot, &(inverse, slope)) in knots.iter_mut().zip(&spans) {
+        let pivot = 2.0 * (before.0 + inverse) - before.0 * eliminated.0;
+        let right = 3.0 * (before.0 * before.1 + inverse * slope);
+        knot.tangent = (right - before.0 * eliminated.1) / pivot;
+        eliminated = (inverse / pivot, knot.tangent);
+        shares.push(eliminated.0);
+        before = (inverse, slope);
+    }
+    for index in (0..knots.len() - 1).rev() {
+        let next = knots[index + 1].tangent;
+        knots[index].tangent -= shares[index] * next;
     }
 }
 
@@ -311,6 +340,21 @@ mod tests {
             assert!((moved_m - 0.1).abs() < 0.01, "{moved_m}");
             assert!(previous.forward.angle_to(point.forward).abs() < 0.02);
             previous = point;
+        }
+    }
+
+    #[test]
+    fn an_arc_through_uneven_knots_has_its_curvature_everywhere() {
+        let arc = (0..30).map(|knot| {
+            let station_m = 2.0 * f64::from(knot) + 0.4 * f64::from(knot).sin();
+            (20.0 * DVec2::from_angle(station_m / 20.0), 0.0)
+        });
+        let centreline = Centreline::from_points(arc);
+        // The ends of the spline are straight.
+        for step in 100..=450 {
+            let [before, after] =
+                [-0.005, 0.005].map(|off_m| centreline.at(0.1 * f64::from(step) + off_m).forward);
+            assert_relative_eq!(before.angle_to(after) / 0.01, 0.05, max_relative = 0.02);
         }
     }
 
