@@ -176,11 +176,11 @@ impl ImuSamples {
         (period_s <= Self::MAX_GAP_S).then(|| a.rate_rad_s.lerp(&b.rate_rad_s, share))
     }
 
-    /// Whether an axis stays at one extreme value again and again, as that of a sensor beyond its range does.
+    /// Whether an axis stays at one extreme value, once for long or again and again, as that of a sensor beyond its range does.
     pub(crate) fn is_saturated(&self) -> bool {
-        /// Measurements in succession, and how often they occur.
+        /// Measurements in succession that count, and how many count in all.
         const LENGTH: usize = 4;
-        const TIMES: usize = 3;
+        const ALL: usize = 12;
         let is_clipped = |value: &dyn Fn(&ImuSample) -> f64| {
             let extreme = self.0.iter().map(value).fold(0.0, |most: f64, value| {
                 if value.abs() > most.abs() {
@@ -189,9 +189,10 @@ impl ImuSamples {
                     most
                 }
             });
-            let mut runs = self.0.chunk_by(|a, b| value(a) == value(b));
+            // The first run may be that of an axis that never changes.
+            let runs = self.0.chunk_by(|a, b| value(a) == value(b)).skip(1);
             let is_long = |run: &&[ImuSample]| run.len() >= LENGTH && value(&run[0]) == extreme;
-            extreme != 0.0 && runs.by_ref().filter(is_long).count() >= TIMES
+            extreme != 0.0 && runs.filter(is_long).map(<[_]>::len).sum::<usize>() >= ALL
         };
         (0..3).any(|axis| {
             is_clipped(&|sample| sample.rate_rad_s[axis])
@@ -301,5 +302,12 @@ mod tests {
             |limit| (ImuSamples::new(samples(1000, swinging(limit))).unwrap()).is_saturated();
         assert!(is_saturated(0.7));
         assert!(!is_saturated(2.0));
+        // One bend that is too sharp for it.
+        let bend = |time_s: f64| ImuSample {
+            rate_rad_s: Vector3::new(0.0, 0.0, (1.0 - (time_s - 5.0).powi(2)).clamp(0.1, 0.7)),
+            ..turning(time_s)
+        };
+        let bend = ImuSamples::new(samples(1000, bend)).unwrap();
+        assert!(bend.is_saturated());
     }
 }
