@@ -36,7 +36,7 @@ impl ParticleFilter {
     ///
     /// N is the noise of one update, in the axes of the car, and s the share of the motion that triggers an
     /// update: a standing car does not lose certainty.
-    fn covariance_after(&self, pending: &Pending, odometry: Odometry) -> Matrix3<f64> {
+    pub(super) fn covariance_after(&self, pending: &Pending, odometry: Odometry) -> Matrix3<f64> {
         let config = &self.config;
         let motion = &pending.motion;
         let moved_m = motion.translation.vector.norm();

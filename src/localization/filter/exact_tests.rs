@@ -134,7 +134,11 @@ fn a_creeping_car_moves_by_its_odometry_and_during_a_search_from_the_likeliest_p
     let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
     let creep = Pose2::new(Vector2::new(0.08, 0.01), 0.005);
     let check = |places: [Pose2; 3], phase: Phase, expected: Pose2| {
-        let mut filter = tracking(LocalizerConfig::of_test(3), start, Matrix3::zeros());
+        let config = LocalizerConfig {
+            motion: OdometryNoise::constant(0.0, 0.0, 0.0),
+            ..LocalizerConfig::of_test(3)
+        };
+        let mut filter = tracking(config, start, Matrix3::zeros());
         filter.particles = ParticleSet::uniform(places);
         filter.phase = phase;
         let mut rng = StdRng::seed_from_u64(1);
@@ -239,10 +243,11 @@ fn a_scan_is_registered_where_the_odometry_since_the_last_update_leads() {
 #[test]
 fn a_pose_that_becomes_imprecise_between_updates_is_reported_as_searching() {
     // A motion of 0.2 m is an update, with a variance of 1 m² along the car: 0.04 m² after 8 mm.
-    let config = LocalizerConfig {
+    let mut config = LocalizerConfig {
         motion: OdometryNoise::constant(1e-3, 1.0, 1e-3),
         ..LocalizerConfig::of_test(3)
     };
+    config.proposal.scan = false;
     let street = TestWorld::street();
     let start = street.pose_at(0.0, 0.0, 0.7);
     let scan = street.scan(&start);
@@ -258,6 +263,39 @@ fn a_pose_that_becomes_imprecise_between_updates_is_reported_as_searching() {
     });
     let [tracking, searching] = [State::Tracking, State::Searching];
     assert_eq!(states, [tracking, tracking, searching, searching]);
+}
+
+#[test]
+fn the_scan_of_a_creeping_car_is_used_where_its_odometry_is_less_certain() {
+    let street = TestWorld::street();
+    let start = street.pose_at(0.0, 0.0, 0.7);
+    // Where the odometry reports 2 cm, the car moved 6 cm.
+    let truth = start * Pose2::translation(0.06, 0.0);
+    let step = |noise: f64| {
+        let mut config = LocalizerConfig {
+            motion: OdometryNoise::constant(noise, noise, noise),
+            ..LocalizerConfig::of_test(300)
+        };
+        config.proposal.registration.map_error_m = 0.004;
+        let mut filter = tracking(config, start, Matrix3::zeros());
+        filter.particles = ParticleSet::uniform([start; 300]);
+        let creep = Odometry::Increment(Pose2::translation(0.02, 0.0));
+        let mut rng = StdRng::seed_from_u64(1);
+        let attitude = SensorAttitude::default();
+        let frame = filter.step(creep, &street.scan(&truth), &attitude, &mut rng);
+        let frame = frame.unwrap();
+        let off_m = (frame.pose.translation.vector - truth.translation.vector).norm();
+        (frame.updated, off_m)
+    };
+    // A tenth of the motion that is an update has a tenth of its variance: 16 mm, where the error of the map is 4 mm.
+    let (is_used, off_m) = step(0.05);
+    assert!(is_used && off_m < 0.01, "{is_used}, {off_m} m");
+    // 3 mm.
+    let (is_used, off_m) = step(0.01);
+    assert!(
+        !is_used && (off_m - 0.04).abs() < 0.001,
+        "{is_used}, {off_m} m"
+    );
 }
 
 #[test]
@@ -355,10 +393,11 @@ fn the_pose_of_an_update_whose_scan_agrees_far_less_than_usual_is_not_sure() {
 
 #[test]
 fn the_uncertain_heading_of_a_creeping_car_makes_its_position_uncertain() {
-    let config = LocalizerConfig {
+    let mut config = LocalizerConfig {
         motion: OdometryNoise::constant(0.0, 0.0, 0.0),
         ..LocalizerConfig::of_test(3)
     };
+    config.proposal.scan = false;
     let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
     let of_heading = Matrix3::from_diagonal(&Vector3::new(0.0, 0.0, 0.01));
     let mut filter = tracking(config, start, of_heading);

@@ -1,5 +1,6 @@
 //! One step of the filter: propagation, measurement update, change of the phase, resampling.
 
+use nalgebra::Matrix3;
 use rand::Rng;
 
 use super::phase::{Evidence, Phase};
@@ -11,7 +12,7 @@ use crate::localization::estimate::Estimate;
 use crate::localization::motion::{TurnDriveTurn, VelocityCommand};
 use crate::localization::observation::{above_road, agreement, choose_beams, ranges_along};
 use crate::localization::odometry::Odometry;
-use crate::localization::particles::spread;
+use crate::localization::particles::{long_axis_m, spread};
 use crate::localization::resampling::systematic;
 use crate::map::SensorAttitude;
 use crate::rendering::RenderError;
@@ -79,11 +80,24 @@ impl ParticleFilter {
 
     /// Without odometry every scan is used: nothing else shows whether the car moves.
     fn is_update_due(&self, odometry: Odometry) -> bool {
-        let moved_far = |pending: &Pending| {
+        let is_due = |pending: &Pending| {
             pending.motion.translation.vector.norm() > self.config.move_thres_m
                 || pending.motion.rotation.angle().abs() > self.config.turn_thres_rad
+                || self.is_less_certain(pending, odometry)
         };
-        odometry == Odometry::Unknown || self.pending.as_ref().is_none_or(moved_far)
+        odometry == Odometry::Unknown || self.pending.as_ref().is_none_or(is_due)
+    }
+
+    /// Whether the motion since the last update has made a pose that is tracked less certain than a registration of the scan.
+    fn is_less_certain(&self, pending: &Pending, odometry: Odometry) -> bool {
+        /// Ratio of the standard deviations of the position.
+        const RATIO: f64 = 2.0;
+        let of_map = self.config.proposal.registration.of_map();
+        let deviation_m = |covariance: Matrix3<f64>| long_axis_m(&(covariance + of_map));
+        self.config.proposal.scan
+            && self.phase.is_tracking()
+            && deviation_m(self.covariance_after(pending, odometry))
+                > RATIO * deviation_m(self.updated.covariance)
     }
 
     /// The prediction of a frame in which the car hardly moved; `None` where its scan contradicts a pose that is tracked:
