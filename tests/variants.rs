@@ -238,7 +238,9 @@ impl World {
             let [of_row, link] = [*row, frame].map(|it| format!("variant/{it:06}.bin"));
             fs::hard_link(self.path(&of_row), self.path(&link)).unwrap();
         }
-        let ended = self.localize("variant".as_ref(), "map.ply".as_ref(), &[]);
+        // A car that turns back at once moves as no times of points explain.
+        let compensated = ["--set=motion_compensation=null"];
+        let ended = self.localize("variant".as_ref(), "map.ply".as_ref(), &compensated);
         let truth: Vec<_> = rows.iter().map(|row| Some(self.truth[*row])).collect();
         self.judged(ended, &truth)
     }
