@@ -8,6 +8,7 @@ use rand::{SeedableRng, rngs::StdRng};
 
 use super::ParticleFilter;
 use super::phase::{Phase, Search};
+use super::reweight::Update;
 use super::state::{Pending, Updated};
 use crate::geometry::Pose2;
 use crate::lidar::{LidarModel, RangeImage};
@@ -462,6 +463,77 @@ fn a_search_has_as_many_particles_as_kld_sampling_demands() {
     filter.phase = Phase::Tracking;
     filter.resample(&mut rng);
     assert_eq!(filter.particles.len(), 100);
+}
+
+#[test]
+fn particles_are_resampled_where_few_are_effective_and_where_fewer_track_a_pose() {
+    let config = LocalizerConfig {
+        num_reduced: 100,
+        ..LocalizerConfig::of_test(400)
+    };
+    let least = config.resampling.min_effective_fraction;
+    let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
+    let after = |count: usize, effective: f64| {
+        let mut filter = tracking(config.clone(), start, Matrix3::zeros());
+        filter.particles = ParticleSet::uniform(std::iter::repeat_n(start, count));
+        let log = |number| if number < effective { 0.0 } else { -1e3 };
+        let logs: Vec<f64> = (0..count).map(|number| log(number as f64)).collect();
+        filter.particles.reweight(&logs);
+        let mut rng = StdRng::seed_from_u64(1);
+        filter
+            .prepare_next(&empty_scan(), &SensorAttitude::default(), &mut rng)
+            .unwrap();
+        let effective = filter.particles.effective_sample_size().round() as usize;
+        (filter.particles.len(), effective)
+    };
+    let above = (100.0 * least + 5.0).round();
+    assert_eq!(after(100, above), (100, above as usize));
+    assert_eq!(after(100, above - 10.0), (100, 100));
+    assert_eq!(after(400, 400.0), (100, 100));
+}
+
+#[test]
+fn the_motion_between_updates_is_known_if_the_pose_was_certain_at_both() {
+    let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
+    let step = Pose2::new(Vector2::new(1.0, 0.1), 0.02);
+    let motion = |was_narrow: bool, apart_m: f64| {
+        let mut filter = tracking(LocalizerConfig::of_test(6), start, Matrix3::zeros());
+        filter.updated.is_narrow = was_narrow;
+        let sides = [-0.5, 0.5].map(|side| start * step * Pose2::translation(side * apart_m, 0.0));
+        filter.particles = ParticleSet::uniform(sides);
+        let update = Update {
+            mean_cost_m: None,
+            beams: vec![],
+            attitude: SensorAttitude::default(),
+            pose: None,
+        };
+        filter.updated_estimate(&update).unwrap();
+        filter.last_motion.map(|last| last.increment)
+    };
+    assert_relative_eq!(motion(true, 0.01).unwrap(), step, epsilon = 1e-9);
+    assert_eq!(motion(false, 0.01), None);
+    assert_eq!(motion(true, 4.0), None);
+    assert_eq!(motion(false, 4.0), None);
+}
+
+#[test]
+fn places_are_compared_while_the_car_may_be_in_several() {
+    let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
+    let found = |search: Search, apart_m: f64, scan: bool| {
+        let mut config = LocalizerConfig::of_test(6);
+        config.proposal.scan = scan;
+        let mut filter = tracking(config, start, Matrix3::zeros());
+        let sides = [-0.5, 0.5].map(|side| start * Pose2::translation(side * apart_m, 0.0));
+        filter.particles = ParticleSet::uniform(sides);
+        filter.phase = Phase::Searching { search, updates: 1 };
+        (filter.compares_places(), filter.likely_places())
+    };
+    let places = Search::Places { likely: 3 };
+    assert_eq!(found(places, 30.0, true), (true, 3));
+    assert_eq!(found(Search::Anywhere, 30.0, true), (true, 1));
+    assert_eq!(found(Search::Around, 30.0, true), (false, 1));
+    assert_eq!(found(places, 0.01, true), (false, 1));
+    assert_eq!(found(places, 30.0, false), (false, 1));
 }
 
 #[test]

@@ -181,3 +181,76 @@ fn weighted_mean(particles: &ParticleSet, costs_m: &[Option<f64>]) -> Option<f64
         });
     (weight > 0.0).then(|| sum / weight)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use approx::assert_relative_eq;
+    use nalgebra::{Matrix3, Vector3};
+    use rand::{SeedableRng as _, rngs::StdRng};
+
+    use super::super::phase::{Phase, Search};
+    use super::*;
+    use crate::lidar::LidarModel;
+    use crate::localization::LocalizerConfig;
+    use crate::localization::proposal::Gaussian;
+    use crate::map::gaussian_for_tests::GaussianWorld;
+    use crate::map::world_for_tests::TestWorld;
+
+    #[test]
+    fn each_round_of_a_search_leaves_the_requested_share_of_effective_particles() {
+        const COUNT: usize = 4000;
+        let street = TestWorld::street();
+        let start = street.pose_at(0.0, 0.0, 0.0);
+        let mut config = LocalizerConfig::of_test(COUNT);
+        config.num_reduced = COUNT;
+        config.resampling.jitter = 0.0;
+        config.tempering.min_effective_fraction = 0.5;
+        let scale_m = config.observation.scale_m;
+        let mut rng = StdRng::seed_from_u64(1);
+        let prior = Matrix3::from_diagonal(&Vector3::new(1.0, 1e-4, 1e-6));
+        let poses = Gaussian::new(start, prior).unwrap().sample(COUNT, &mut rng);
+        let mut variance_m2 = |rounds: usize| {
+            let mut config = config.clone();
+            config.tempering.searching_rounds = rounds;
+            let mut map = street.map();
+            map.renderer = Arc::new(GaussianWorld {
+                mean: start,
+                information: Matrix3::from_diagonal(&Vector3::new(1e6, 0.0, 0.0)),
+                scale_m,
+            });
+            let particles = ParticleSet::uniform(poses.iter().copied());
+            let mut filter = ParticleFilter::new(config, map, None, particles).unwrap();
+            let search = Search::Around;
+            filter.phase = Phase::Searching { search, updates: 1 };
+            let scan = RangeImage::project(&[], &LidarModel::default());
+            filter
+                .reweight_in_rounds(&scan, &SensorAttitude::default(), &mut rng)
+                .unwrap();
+            let particles = &filter.particles;
+            particles.covariance_about(&particles.mean())[(0, 0)]
+        };
+        // A normal distribution whose variance is divided by 1 + u leaves a share of sqrt(1 + 2 u) / (1 + u).
+        let divided = 4.0 + 12.0_f64.sqrt();
+        for rounds in 1..=3 {
+            let expected = divided.powi(-(rounds as i32));
+            assert_relative_eq!(variance_m2(rounds), expected, max_relative = 0.2);
+        }
+    }
+
+    #[test]
+    fn the_mean_cost_is_that_of_the_particles_on_the_map_by_their_weights() {
+        let weighted = [0.2, 0.3, 0.5].map(|weight| Particle {
+            weight,
+            ..Particle::new(Pose2::identity(), None)
+        });
+        let particles = ParticleSet::weighted(weighted.into());
+        let mean = |costs_m: [Option<f64>; 3]| weighted_mean(&particles, &costs_m);
+        assert_eq!(mean([None; 3]), None);
+        assert_relative_eq!(mean([Some(0.04); 3]).unwrap(), 0.04, epsilon = 1e-12);
+        // Two parts of seven of 0.7 m, and five of 1.4 m.
+        let found = mean([Some(0.7), None, Some(1.4)]).unwrap();
+        assert_relative_eq!(found, 1.2, epsilon = 1e-12);
+    }
+}
