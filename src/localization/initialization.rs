@@ -217,6 +217,47 @@ mod tests {
     }
 
     #[test]
+    fn half_of_the_particles_are_equally_in_the_best_cells_and_all_head_as_their_panoramas() {
+        let world = TestWorld::street();
+        let request = PanoramaRequest {
+            region: SearchRegion::Road,
+            lidar: LidarModel::default(),
+            sensor_height_m: 1.73,
+            config: PanoramaConfig {
+                yaw_sigma_deg: 0.0,
+                ..PanoramaConfig::default()
+            },
+        };
+        let index = world.map().panoramas(&request).unwrap();
+        let scan = world.scan(&world.pose_at(33.0, 0.4, 0.2));
+        let attitude = SensorAttitude::default();
+        let places = PlacesConfig {
+            most: 4,
+            ..PlacesConfig::default()
+        };
+        let mut rng = StdRng::seed_from_u64(1);
+        let particles = from_panoramas(&index, &scan, &attitude, 1000, &places, &mut rng).unwrap();
+        let seeds = index.search(&scan, &attitude).unwrap();
+        let half_column_rad = std::f64::consts::PI / index.model.width as f64;
+        let is_of = |seed: &PanoramaSeed, particle: &Particle| {
+            let pose = &particle.map_from_lidar;
+            let off_m = (pose.translation.vector - seed.center.coords).amax();
+            let turn_rad = wrap_angle(pose.rotation.angle() - seed.heading_rad).abs();
+            off_m <= 0.5 * index.config.cell_m + 1e-9 && turn_rad <= half_column_rad + 1e-9
+        };
+        let is_of_any = |particle: &Particle| seeds.iter().any(|seed| is_of(seed, particle));
+        assert!(particles.iter().all(is_of_any));
+        let best = best_of_places(&seeds, &places);
+        assert_eq!((best.len(), best[0]), (4, 0));
+        for place in best {
+            let of_place = particles.iter().filter(|it| is_of(&seeds[place], it));
+            // An eighth of them, up to rounding.
+            let count = of_place.count();
+            assert!(count >= 124, "{count}");
+        }
+    }
+
+    #[test]
     fn panorama_samples_lie_around_the_truth() {
         let world = TestWorld::street();
         let truth = world.pose_at(33.0, 0.4, 0.2);

@@ -354,6 +354,19 @@ mod tests {
     }
 
     #[test]
+    fn beams_that_may_all_end_on_the_road_do_so_as_often_as_those_of_the_scan() {
+        let world = TestWorld::street();
+        let image = world.scan(&world.pose_at(0.0, 0.0, 0.0));
+        let attitude = SensorAttitude::default();
+        let high_share =
+            |beams: &[Beam]| above_road(beams, &attitude, 0.3).len() as f64 / beams.len() as f64;
+        let all: Vec<Beam> = image.beams().collect();
+        let mut rng = StdRng::seed_from_u64(1);
+        let chosen = choose_beams(&image, 1000, 1.0, &attitude, &mut rng);
+        assert_relative_eq!(high_share(&chosen), high_share(&all), epsilon = 0.02);
+    }
+
+    #[test]
     fn a_cost_that_is_larger_by_the_scale_is_e_times_less_likely() {
         let robust = ObservationConfig {
             scale_m: 0.003,
@@ -369,6 +382,18 @@ mod tests {
         for (cost_m, expected) in [(0.0, 0.0), (1.5, -0.5), (3.0, -2.0)] {
             assert_relative_eq!(reference.log_likelihood(cost_m), expected);
         }
+    }
+
+    #[test]
+    fn the_beams_of_all_poses_are_those_of_the_ray_budget_within_the_limits_of_a_pose() {
+        let config = ObservationConfig {
+            ray_budget: 1000,
+            min_beams: 10,
+            beams: 200,
+            ..ObservationConfig::default()
+        };
+        let beams = [0, 1, 5, 20, 50, 100, 300].map(|poses| config.beams_for(poses));
+        assert_eq!(beams, [200, 200, 200, 50, 20, 10, 10]);
     }
 
     #[test]
