@@ -384,6 +384,29 @@ mod tests {
     }
 
     #[test]
+    fn a_point_is_static_if_no_further_votes_make_a_majority_of_enough_beams_pass_through_it() {
+        let config = VisibilityConfig {
+            point_votes: 3,
+            ..VisibilityConfig::default()
+        };
+        for (through, seen, left, expected) in [
+            (2, 0, 0, true),
+            (3, 5, 0, false),
+            (3, 6, 0, true),
+            (5, 9, 0, false),
+            (5, 10, 0, true),
+            (1, 0, 1, true),
+            (1, 0, 2, false),
+            (3, 10, 2, true),
+            (3, 10, 3, false),
+        ] {
+            let votes = PointVotes { through, seen };
+            let found = votes.is_static(left, &config);
+            assert_eq!(found, expected, "{through} {seen} {left}");
+        }
+    }
+
+    #[test]
     fn false_surfaces_are_removed_and_those_that_beams_end_on_are_kept() {
         let scans = three_scans(&wall());
         let mut mesh = wall();
@@ -495,6 +518,19 @@ mod tests {
                 removed
             );
         }
+    }
+
+    #[test]
+    fn a_wall_is_static_however_far_from_it_the_other_scans_are() {
+        let at = |x: f32| scan(&wall(), Vec3::new(x, 1.5, 0.5));
+        let scans = [4.0, 0.0, -5.0, -9.0].map(at);
+        let is_static = static_points(&scans, &model(), &VisibilityConfig::default());
+        let positions = &scans[0].cloud.positions;
+        let inside: Vec<bool> = (positions.iter().zip(&is_static[0]))
+            .filter(|(at, _)| at.y.abs() < 8.0 && at.z.abs() < 2.0)
+            .map(|(_, &is_static)| is_static)
+            .collect();
+        assert!(inside.len() > 50 && inside.iter().all(|&is_static| is_static));
     }
 
     #[test]
