@@ -364,6 +364,9 @@ mod tests {
         // The next submap shares its surfaces.
         assert_eq!(confirmed(&[([0, 8], 0.0), ([1, 9], 0.0)], 3.0), [false; 2]);
         assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 8], 0.0)], 3.0), [false; 2]);
+        // Another place of one of both visits is enough.
+        assert_eq!(confirmed(&[([0, 8], 0.0), ([0, 10], 0.0)], 3.0), [true; 2]);
+        assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 9], 0.0)], 3.0), [true; 2]);
         // The ways of 20 m drift by 0.5 m + 2 % of 40 m, and submaps are exact to a voxel of 0.5 m.
         assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 10], 1.7)], 3.0), [true; 2]);
         assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 10], 1.9)], 3.0), [false; 2]);
@@ -372,6 +375,21 @@ mod tests {
         assert_eq!(confirmed(&three, 3.0), [true, true, false]);
         // Too far from each other: 40 m over both visits, and a limit of 2 · 0.3 · 50 m.
         assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 10], 0.0)], 0.3), [false; 2]);
+    }
+
+    #[test]
+    fn a_loop_of_another_heading_confirms_as_far_as_it_moves_points_at_half_of_the_range() {
+        let (drive, maps) = two_rounds();
+        let config = LoopConfig::default();
+        let confirmed = |turn_rad: f64| {
+            let mut loops = [[0, 8], [2, 10]].map(|maps| found(&drive, maps, 0.0));
+            loops[1].first_from_second *= Pose3::rotation(Vector3::z() * turn_rad);
+            super::confirmed(&drive, &maps, &loops, DRIFT, &config)
+        };
+        // 25 m away they move by up to 1.8 m: 0.5 m, 2 % of the ways of 40 m, and a voxel of 0.5 m.
+        for (turn_rad, expected) in [(0.07, true), (-0.07, true), (0.074, false), (-0.074, false)] {
+            assert_eq!(confirmed(turn_rad), [expected; 2], "{turn_rad}");
+        }
     }
 
     /// A pole in each sector of 6 degrees of Scan Context, in rings of 1.5 m, on the ground.
@@ -495,5 +513,40 @@ mod tests {
             (7.0, beyond_radius),
         ];
         assert_relative_eq!(share(&mixed), 0.5);
+    }
+
+    #[test]
+    fn points_are_in_a_common_bush_up_to_three_times_its_variance() {
+        let (drive, _) = two_rounds();
+        // The corners of a box around a corner of the voxels, with a variance of 0.0469 m².
+        let center = DVec3::new(5.0, 8.0, 2.0);
+        let sides = |corner: u8| {
+            DVec3::new(
+                f64::from(corner & 1),
+                f64::from(corner >> 1 & 1),
+                f64::from(corner >> 2),
+            ) * 2.0
+                - 1.0
+        };
+        let corners = (0..8).map(|corner| center + sides(corner) * DVec3::new(0.15, 0.12, 0.1));
+        let mut bush = VoxelMap::new(drive.voxel_m, 1000.0);
+        bush.insert(&corners.collect::<Vec<DVec3>>());
+        let config = LoopConfig::default();
+        let share = |offset: DVec3| {
+            let point = TimedPoint {
+                position: (center + offset).as_vec3(),
+                time_s: 0.0,
+            };
+            common_share(&bush, &[point], &Pose3::identity(), &drive, &config)
+        };
+        for (offset, expected) in [
+            (DVec3::ZERO, 1.0),
+            (DVec3::splat(0.21), 1.0),
+            (DVec3::splat(-0.21), 1.0),
+            (DVec3::splat(0.22), 0.0),
+            (DVec3::new(0.24, -0.24, -0.22), 0.0),
+        ] {
+            assert_eq!(share(offset), expected, "{offset}");
+        }
     }
 }

@@ -88,6 +88,30 @@ fn the_samples_of_all_scans_are_within_the_budget_of_memory() {
     }
 }
 
+#[test]
+fn the_time_between_given_poses_is_that_of_their_scans_or_a_period_where_these_do_not_ascend() {
+    let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default()).unwrap();
+    for time_s in [None, Some(7.0), Some(7.25), Some(7.25), Some(7.2), None] {
+        let scan = Scan {
+            time_s,
+            ..Scan::default()
+        };
+        builder.add_given(&scan, Pose3::identity()).unwrap();
+    }
+    let expected_s = [PERIOD_S, PERIOD_S, 0.25, PERIOD_S, PERIOD_S, PERIOD_S];
+    assert_eq!(builder.estimates.len(), expected_s.len());
+    for (found, expected_s) in builder.estimates.iter().zip(expected_s) {
+        assert!((found.duration_s - expected_s).abs() < 1e-9, "{found:?}");
+    }
+}
+
+#[test]
+fn times_of_scans_are_the_sums_of_the_intervals_since_the_first() {
+    let estimates = [9.0, 0.25, 0.5, 0.25].map(OdometryEstimate::first);
+    assert_eq!(times_s(&estimates), [0.0, 0.25, 0.75, 1.0]);
+    assert!(times_s(&[]).is_empty());
+}
+
 fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
     (a.translation.vector - b.translation.vector).norm()
 }
