@@ -733,6 +733,49 @@ mod tests {
     }
 
     #[test]
+    fn a_smoothed_trajectory_is_where_its_cost_is_least() {
+        let truth = corner();
+        let noisy = disturbed(&truth, 0.05, 0.005, 1);
+        let odometry = disturbed(&increments(&truth), 0.02, 0.001, 101);
+        let (priors, config) = (priors(&noisy, 0.05, 0.005), SmoothingConfig::default());
+        let smoothed = smooth(&noisy, &priors, &odometry, &config);
+        let problem = Problem::new(&priors, &odometry, &config);
+        for frame in 0..truth.len() {
+            for (axis, step) in [1e-4, 1e-4, 1e-5].into_iter().enumerate() {
+                let [before, here, after] = [-step, 0.0, step].map(|step| {
+                    let step = Vector3::ith(axis, step);
+                    let mut moved = smoothed.clone();
+                    moved[frame] *= Pose2::new(step.xy(), step.z);
+                    problem.cost(&moved)
+                });
+                // The minimum of the parabola through the three, in steps.
+                let off = 0.5 * (before - after) / (before - 2.0 * here + after);
+                assert!(off.abs() < 0.01, "{frame} {axis}: {off}");
+            }
+        }
+    }
+
+    #[test]
+    fn after_a_step_that_is_refused_shorter_ones_lead_to_the_truth() {
+        let truth = corner();
+        let (priors, increments) = (priors(&truth, 0.02, 0.002), increments(&truth));
+        let start: Vec<Pose2> = (truth.iter().enumerate())
+            .map(|(frame, pose)| pose * Pose2::rotation(2.6 * (2.5 * frame as f64).sin()))
+            .collect();
+        let after = |iterations: usize| {
+            let config = SmoothingConfig {
+                iterations,
+                ..SmoothingConfig::default()
+            };
+            smooth(&start, &priors, &increments, &config)
+        };
+        assert!(after(1) != start && after(2) == after(1));
+        for (found, truth) in after(20).iter().zip(&truth) {
+            assert_relative_eq!(found, truth, epsilon = 1e-6);
+        }
+    }
+
+    #[test]
     fn without_measured_poses_the_covariance_is_undefined_or_large() {
         let truth = corner();
         let config = SmoothingConfig::default();
