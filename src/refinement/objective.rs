@@ -199,6 +199,23 @@ mod tests {
     }
 
     #[test]
+    fn ground_next_to_a_pose_is_found_within_a_distance() {
+        // The ground ends at x = 401 m.
+        let world = TestWorld::street();
+        let objective = world.objective(&[]);
+        for (x, distance_m, expected) in [
+            (400.0, 0.0, true),
+            (401.8, 1.9, false),
+            (401.8, 2.0, true),
+            (402.5, 5.9, false),
+            (402.5, 6.0, true),
+        ] {
+            let found = objective.patch_within(&Pose2::translation(x, 0.5), distance_m);
+            assert_eq!(found.unwrap().is_some(), expected, "{x} {distance_m}");
+        }
+    }
+
+    #[test]
     fn where_there_is_no_ground_the_cost_is_infinite_unless_ground_is_remembered() {
         let world = TestWorld::street();
         let image = world.scan(&world.pose_at(0.0, 0.0, 0.0));

@@ -395,6 +395,34 @@ mod tests {
     }
 
     #[test]
+    fn an_estimate_outside_the_basin_is_found_by_a_wide_kernel_or_farther_off_by_swarms() {
+        let world = TestWorld::street();
+        let surfaces = UprightSurfaces::new(&world.map().mesh().unwrap());
+        let truth = world.pose_at(18.0, 0.2, 0.05);
+        let beams: Vec<Beam> = world.scan(&truth).beams().step_by(5).collect();
+        let objective = world.objective(&beams);
+        let covariance = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, 0.04));
+        let config = FrameRefinementConfig::default();
+        let error_m = |[x, y, turn_rad]: [f64; 3], distance: Distance<'_>| {
+            let estimate = truth * Pose2::new(Vector2::new(x, y), turn_rad);
+            let mut rng = StdRng::seed_from_u64(1);
+            let (objective, covariance) = (&objective, &covariance);
+            let frame = refine_frame(
+                objective, &estimate, covariance, distance, &config, &mut rng,
+            );
+            error(&frame.unwrap().unwrap(), &truth)
+        };
+        let reach_m = |distance: Distance<'_>| {
+            let offs_m = (1..=30).map(|number| 0.1 * f64::from(number));
+            let found = offs_m
+                .take_while(|off_m| error_m([0.8 * off_m, -0.6 * off_m, 0.02], distance) < 0.02);
+            found.last().unwrap_or(0.0)
+        };
+        assert!(reach_m(Distance::InBasin) < reach_m(Distance::Near));
+        assert!(error_m([2.0, -1.5, 0.4], Distance::Far(&surfaces)) < 0.02);
+    }
+
+    #[test]
     fn an_estimate_is_wide_if_its_reach_exceeds_thirty_centimetres_or_a_twenty_fifth_of_a_radian() {
         let config = FrameRefinementConfig {
             reach_sigmas: 2.0,

@@ -701,6 +701,8 @@ mod tests {
     use super::*;
     use crate::lidar::LidarModel;
     use crate::map::world_for_tests::TestWorld;
+    use crate::map::{GroundPatch, MapCache, MapOptions, MappingPath};
+    use crate::rendering::Backend;
 
     fn sensor() -> Sensor {
         Sensor::new(LidarModel::default())
@@ -838,6 +840,66 @@ mod tests {
     }
 
     #[test]
+    fn upright_surfaces_of_a_map_on_disk_are_those_as_far_as_a_search_looks() {
+        // A road of 600 m with the end of a wall next to it every 10 m.
+        let mut mesh = TriangleMesh::default();
+        let mut quad = |corners: [[f32; 3]; 4], color: [u8; 3]| {
+            let first = mesh.vertices.len() as u32;
+            mesh.vertices.extend(corners.map(glam::Vec3::from));
+            mesh.colors.extend([color; 4]);
+            for [b, c] in [[1, 2], [2, 3]] {
+                mesh.triangles.push([first, first + b, first + c]);
+            }
+        };
+        let wall_x = |number: u8| 10.0 * f32::from(number) + 5.0;
+        for x in (0..60).map(wall_x) {
+            let road = [[-5.0, -9.0], [5.0, -9.0], [5.0, 9.0], [-5.0, 9.0]];
+            quad(road.map(|[dx, y]| [x + dx, y, 0.0]), [255, 0, 0]);
+            let wall = [[6.0, 0.0], [8.0, 0.0], [8.0, 4.0], [6.0, 4.0]];
+            quad(wall.map(|[y, z]| [x, y, z]), [0, 0, 255]);
+        }
+        let path = MappingPath {
+            map_from_lidar: (0..600)
+                .map(|x| Pose3::translation(f64::from(x), 0.0, 1.7))
+                .collect(),
+            ..MappingPath::default()
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("map.ply");
+        let options = MapOptions {
+            backend: Backend::Cpu,
+            cache: MapCache::NextToMap,
+            ..MapOptions::default()
+        };
+        Map::new(mesh, path, &options).unwrap().save(&file).unwrap();
+        let map = Map::load(&file, &options).unwrap();
+        let config = RefinerConfig::default();
+        let reach_m = config.refinement.wide_search.range_m + config.refinement.max_reach_m;
+        let refiner = TrajectoryRefiner::new(&map, &sensor(), config, 0).unwrap();
+        let level = GroundPatch {
+            height_m: 0.0,
+            normal: Vector3::z(),
+        };
+        // Back and forth, twice to the same square.
+        for pose_m in [30.0, 330.0, 345.0, 30.0] {
+            let surfaces = refiner
+                .surfaces_near(&Pose2::translation(pose_m, 0.0))
+                .unwrap();
+            for x in (0..60).map(wall_x).map(f64::from) {
+                let field = surfaces.distances(Vector2::new(x, 7.0), &level, 2.0, 1.5);
+                let off_m = (x - pose_m).abs();
+                if off_m < reach_m {
+                    assert!(field.at(x, 7.0) < 0.5, "{pose_m} {x}");
+                }
+                // Beyond tiles of 100 m that the search reaches no surface is in memory.
+                if off_m > 300.0 {
+                    assert_eq!(field.at(x, 7.0), 1.5, "{pose_m} {x}");
+                }
+            }
+        }
+    }
+
+    #[test]
     fn a_frame_has_the_covariance_of_its_refinement() {
         let world = TestWorld::street();
         let truth = world.pose_at(10.0, 0.0, 0.0);
@@ -934,9 +996,8 @@ mod tests {
     #[test]
     fn frames_that_were_not_tracked_are_placed_from_their_neighbours_or_stay() {
         let world = TestWorld::street();
-        let truth: Vec<Pose2> = (0..6)
-            .map(|row| world.pose_at(10.0 + f64::from(row), 0.0, 0.0))
-            .collect();
+        // Steps of different lengths.
+        let truth = [10.0, 13.0, 15.5, 16.5, 17.0, 19.0].map(|x| world.pose_at(x, 0.0, 0.0));
         let increments: Vec<Pose2> = (0..6_usize)
             .map(|row| truth[row.saturating_sub(1)].inverse() * truth[row])
             .collect();

@@ -200,11 +200,11 @@ mod tests {
     /// Searches for a pose of the street from estimates that are off by x, y [m] and heading [rad]; checks the poses that are
     /// found, and returns their costs [m].
     fn found_on_street<const N: usize>(
+        world: &TestWorld,
         truth_heading_rad: f64,
         offsets: [[f64; 3]; N],
         config: &WideSearchConfig,
     ) -> [f64; N] {
-        let world = TestWorld::street();
         let map = world.map();
         let surfaces = UprightSurfaces::new(&map.mesh().unwrap());
         let truth = world.pose_at(18.0, 0.2, truth_heading_rad);
@@ -236,7 +236,17 @@ mod tests {
     fn a_pose_metres_and_tens_of_degrees_off_is_found() {
         let offsets = [[1.5, -1.0, 15.0], [-2.0, 1.0, -25.0], [2.5, 1.5, 30.0]];
         let offsets = offsets.map(|[x, y, turn_deg]| [x, y, f64::to_radians(turn_deg)]);
-        found_on_street(0.05, offsets, &WideSearchConfig::default());
+        let config = WideSearchConfig::default();
+        found_on_street(&TestWorld::street(), 0.05, offsets, &config);
+    }
+
+    #[test]
+    fn a_pose_is_found_wherever_the_street_is_in_the_map() {
+        let config = WideSearchConfig::default();
+        for (x, y, heading_rad) in [(40.0, -25.0, 0.8), (-30.0, 60.0, -2.0)] {
+            let world = TestWorld::moved_street(Pose2::new(Vector2::new(x, y), heading_rad));
+            found_on_street(&world, 0.05, [[1.5, -1.0, 0.2]], &config);
+        }
     }
 
     #[test]
@@ -245,7 +255,12 @@ mod tests {
             kernel_m: 0.1,
             ..WideSearchConfig::default()
         };
-        let costs_m = found_on_street(0.5, [[2.0, -1.5, 0.4], [-2.5, 1.0, -0.5]], &config);
+        let costs_m = found_on_street(
+            &TestWorld::street(),
+            0.5,
+            [[2.0, -1.5, 0.4], [-2.5, 1.0, -0.5]],
+            &config,
+        );
         assert!(costs_m.iter().all(|cost_m| *cost_m < 0.01), "{costs_m:?}");
     }
 
