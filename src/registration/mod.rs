@@ -392,6 +392,23 @@ mod tests {
     }
 
     #[test]
+    fn a_cautious_registration_has_twice_the_noise_of_normals_and_else_the_same_settings() {
+        let config = RegistrationConfig {
+            iterations: 7,
+            kernel_m: 0.3,
+            normal_rad: 0.015,
+            ..RegistrationConfig::default()
+        };
+        let cautious = config.cautious();
+        assert_eq!(cautious.normal_rad, 0.03);
+        let same = RegistrationConfig {
+            normal_rad: 0.015,
+            ..cautious
+        };
+        assert_eq!(same, config);
+    }
+
+    #[test]
     fn noise_of_normals_along_a_tunnel_is_no_information() {
         let usual = RegistrationConfig::default();
         // Normals with a noise of 0.02 rad, and for poses that are not certain of 0.05 rad.
