@@ -121,6 +121,19 @@ mod tests {
     }
 
     #[test]
+    fn the_exponent_is_never_above_the_largest_though_more_may_be_effective_there() {
+        // With a growing exponent, the weight is that of many unlikely particles, of one, then of many others.
+        let particles = [(100, 0.01, -60.0), (1, 1e-3, -10.0), (100, 1e-9, 0.0)];
+        let (weights, logs): (Vec<f64>, Vec<f64>) = (particles.into_iter())
+            .flat_map(|(count, weight, log)| std::iter::repeat_n((weight, log), count))
+            .unzip();
+        assert!(effective(&weights, &logs, 0.5) < 5.0 && effective(&weights, &logs, 1.0) > 5.0);
+        let beta = exponent(&weights, &logs, 5.0, 0.5);
+        assert!(beta < 0.5, "{beta}");
+        assert_relative_eq!(effective(&weights, &logs, beta), 5.0, max_relative = 0.01);
+    }
+
+    #[test]
     fn weights_with_too_few_effective_particles_are_unchanged() {
         assert_eq!(
             exponent(&[0.97, 0.01, 0.01, 0.01], &[0.0, -9.0, 0.0, 0.0], 3.0, 1.0),
