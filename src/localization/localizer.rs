@@ -166,8 +166,8 @@ impl Localizer {
             _ => before,
         };
         let predicted = self.sweep.predict(odometry, duration_s);
-        let near = self.registered(scan, odometry, known, predicted.as_ref(), &mut rng)?;
-        let found = near.and_then(|pose| self.sweep.around(&pose, duration_s));
+        let start = self.registered(scan, odometry, known, predicted.as_ref(), &mut rng)?;
+        let found = start.and_then(|pose| self.sweep.around(&pose, duration_s));
         let motion = found.or(predicted);
         let image = self.preparation.range_image(scan, motion.as_ref());
         if let Some(attitude) = known.or_else(|| self.preparation.attitude(&image)) {
@@ -182,7 +182,7 @@ impl Localizer {
         };
         let filter = self.filter.insert(filter);
         filter.set_duration_s(duration_s);
-        filter.set_registration_start(near);
+        filter.set_registration_start(start);
         let mut estimate = filter.step(odometry, &image, &self.attitude, &mut rng)?;
         if let Some(found) = filter.attitude().filter(|found| Some(*found) != before) {
             self.attitude = found;

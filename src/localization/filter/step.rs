@@ -88,7 +88,7 @@ impl ParticleFilter {
         odometry == Odometry::Unknown || self.pending.as_ref().is_none_or(is_due)
     }
 
-    /// Whether the motion since the last update has made a pose that is tracked less certain than a registration of the scan.
+    /// Whether a pose that is tracked and registered is less certain, by the motion since the last update, than that left it.
     fn is_less_certain(&self, pending: &Pending, odometry: Odometry) -> bool {
         /// Ratio of the standard deviations of the position.
         const RATIO: f64 = 2.0;
