@@ -79,7 +79,7 @@ impl SecondDrive {
     /// Closes loops and adjusts all poses to the surfaces of the map.
     ///
     /// # Errors
-    /// The drive was not found in the map, the surfaces of the map cannot be read, or memory does not suffice.
+    /// The drive was not found in the map, the map lacks the surfaces around it or cannot be read, or memory does not suffice.
     pub fn finish(self) -> Result<Trajectory, SecondDriveError> {
         /// The map is needed around the scans that were found, as far as a sensor sees [m].
         const RADIUS_M: f64 = 150.0;

@@ -65,7 +65,7 @@ pub fn build_map(recording: &Recording, config: &MapConfig) -> Result<Map, Mappi
 /// pass through is removed, and what the map does not have is added.
 ///
 /// # Errors
-/// As [`build_map`]; the recording is not found in the map.
+/// As [`build_map`]; the recording is not found in the map, or the map lacks the surfaces around it.
 pub fn extend_map(
     map: &Map,
     recording: &Recording,

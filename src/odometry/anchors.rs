@@ -30,6 +30,18 @@ pub enum PlacementError {
     /// It was not found there.
     #[error(transparent)]
     NotInMap(#[from] NotInMap),
+    /// The map lacks the surfaces around the poses at which the scans were found.
+    #[error(
+        "scans of the recording were found in the map, but at most {:.1} % of the surfaces around one of them are in it, and more than {:.1} % are required (loop_closure.min_common_share): the map may be of another road, or its cells too coarse",
+        1e2 * share,
+        1e2 * least
+    )]
+    FewCommonSurfaces {
+        /// Largest share of the surfaces in common of all submaps, without the ground (unitless).
+        share: f64,
+        /// Required share, `min_common_share` (unitless).
+        least: f64,
+    },
     /// Its scans do not fit the budget of memory.
     #[error(transparent)]
     Memory(#[from] MemoryError),
@@ -67,16 +79,18 @@ pub fn place(
     let surfaces = surface_points(mesh, drive, SPACING * drive.voxel_m, budget)?;
     let mut voxels = VoxelMap::new(drive.voxel_m, f32::MAX);
     voxels.insert(&surfaces);
-    let in_map: Vec<Edge> = map_edges(drive, &maps, &found)
-        .into_iter()
-        .filter(|edge| {
-            let points = drive.submap_points(&maps[edge.second - 1], 2.0 * drive.voxel_m);
-            common_share(&voxels, &points, &edge.first_from_second, drive, config)
-                > config.min_common_share
-        })
-        .collect();
+    let least = config.min_common_share;
+    let (mut in_map, mut share): (Vec<Edge>, f64) = (vec![], 0.0);
+    for edge in map_edges(drive, &maps, &found) {
+        let points = drive.submap_points(&maps[edge.second - 1], 2.0 * drive.voxel_m);
+        let common = common_share(&voxels, &points, &edge.first_from_second, drive, config);
+        share = share.max(common);
+        if common > least {
+            in_map.push(edge);
+        }
+    }
     if in_map.is_empty() {
-        return Err(NotInMap.into());
+        return Err(PlacementError::FewCommonSurfaces { share, least });
     }
     // The map is the first pose of the graph.
     let mut edges = odometry_edges(drive, &maps, odometry);

@@ -260,10 +260,29 @@ fn a_drive_that_leaves_a_map_is_in_its_frame_although_one_pose_in_it_is_wrong() 
 
     let nowhere = builder.clone().finish_in_map(&mesh, &[None; 28]);
     assert_eq!(nowhere.unwrap_err(), NotInMap.into());
-    // No share of the surfaces is larger than all of them.
+    // A map of what the scans see on their left.
+    let of_left = |scan: &Scan| Scan {
+        points: scan
+            .points
+            .iter()
+            .copied()
+            .filter(|point| point.y > 0.0)
+            .collect(),
+        ..Scan::default()
+    };
+    let left: Vec<Scan> = mapped.iter().map(of_left).collect();
     builder.config.loop_closure.min_common_share = 1.0;
-    let strict = builder.finish_in_map(&mesh, &found);
-    assert_eq!(strict.unwrap_err(), NotInMap.into());
+    let strict = builder.finish_in_map(&surfaces_of(&left, &mapped_poses), &found);
+    let refused = strict.unwrap_err();
+    let PlacementError::FewCommonSurfaces { share, least: 1.0 } = refused else {
+        panic!("{refused}");
+    };
+    assert!((0.1..0.9).contains(&share), "{share}");
+    assert!(
+        refused
+            .to_string()
+            .contains("more than 100.0 % are required")
+    );
 }
 
 #[test]
