@@ -10,8 +10,8 @@
 //!
 //! A place that was found by a search is confirmed by the share of one scan if nearly all of its beams agree, else by
 //! those of several scans in turn: many places agree with a single scan of few beams. A pose that was uncertain in
-//! between, as along a tunnel, is confirmed by a share that is not below the slow average. Where nothing is compared, nothing is
-//! confirmed.
+//! between, as along a tunnel, is confirmed by a share that is not below the slow average, or by one of at least `sure_agreement` that is nearer
+//! to that average than to a loss. Where nothing is compared, nothing is confirmed.
 //!
 //! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) averages the
 //! likelihood instead; here traffic in front of the map must not raise an alarm: beams that end far in front of the map are
@@ -80,7 +80,8 @@ pub struct TrackingLossConfig {
     /// Tracking is lost below this fraction of the slow average (unitless).
     #[default(0.75)]
     pub lost_fraction: f64,
-    /// A place that was found is the right one from this share of agreeing beams on (unitless).
+    /// A place that was found is the right one from this share of agreeing beams on; a pose that became uncertain too, if the
+    /// share is also nearer to the slow average than to a loss (unitless).
     #[default(0.8)]
     pub sure_agreement: f64,
     /// Least share of updates that confirm it in turn (unitless).
@@ -185,10 +186,13 @@ impl AgreementMonitor {
         both.is_some_and(|(share, slow)| share < config.lost_fraction * slow)
     }
 
-    /// Whether a share confirms a pose that was uncertain: it is as large as usual here, or nearly all beams agree.
+    /// Whether a share confirms a pose that was uncertain: it is as large as usual here, or nearly all beams agree and it is
+    /// nearer to the usual one than to a loss. A wrong pose beyond a tunnel, in which all beams agreed, does not reach that.
     pub fn is_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
+        let is_near = |share: f64, slow: f64| share >= 0.5 * (1.0 + config.lost_fraction) * slow;
         agreement.is_some_and(|share| {
-            share >= config.sure_agreement || self.slow.is_none_or(|slow| share >= slow)
+            let is_sure = share >= config.sure_agreement;
+            (self.slow).is_none_or(|slow| share >= slow || is_sure && is_near(share, slow))
         })
     }
 }
@@ -254,14 +258,25 @@ mod tests {
         let config = TrackingLossConfig::default();
         let mut monitor = AgreementMonitor::default();
         (0..100).for_each(|_| monitor.observe(Some(0.98), &config));
-        // Two metres off behind a tunnel of which every scan agreed.
+        // Two metres off beyond a tunnel in which every scan agreed.
         (0..10).for_each(|_| monitor.observe(Some(0.77), &config));
         assert!(!monitor.is_usual(Some(0.77), &config));
         assert!(monitor.is_usual(Some(0.9), &config));
+        // A metre off there, between the predicted pose and the right one.
+        let mut behind = AgreementMonitor::default();
+        (0..100).for_each(|_| behind.observe(Some(0.99), &config));
+        let falling = (0..14).map(|number| 0.99 - 0.012 * f64::from(number));
+        falling.for_each(|share| behind.observe(Some(share), &config));
+        assert!(!behind.is_usual(Some(0.82), &config));
+        assert!(behind.is_usual(Some(0.87), &config) && !behind.is_usual(None, &config));
         // Where a street has changed, fewer beams always agree.
         let mut changed = AgreementMonitor::default();
         (0..100).for_each(|_| changed.observe(Some(0.7), &config));
         assert!(changed.is_usual(Some(0.71), &config));
+        // Near the usual share, but not of nearly all beams.
+        let mut between = AgreementMonitor::default();
+        between.observe(Some(0.85), &config);
+        assert!(between.is_usual(Some(0.81), &config) && !between.is_usual(Some(0.79), &config));
     }
 
     #[test]

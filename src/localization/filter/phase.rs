@@ -9,7 +9,7 @@
 //! Tracking   agreement too low, or particles scattered       Lost       the scan does not fit, or nothing holds the pose
 //! Tracking   not precise                                     Uncertain  the pose is followed by the odometry
 //! Uncertain  agreement too low, or particles scattered       Lost       as while tracking
-//! Uncertain  twice as precise, and the agreement as usual    Tracking   the pose is confirmed again
+//! Uncertain  twice as precise, agreement nearly as usual     Tracking   the pose is confirmed again
 //! Lost       confirmed and precise, agreement high enough    Tracking   the alarm was false
 //! Lost       confirmed, agreement high enough                Uncertain  the alarm was false
 //! Lost       panoramas resemble the scan                     Searching  restart, within the same frame
@@ -77,7 +77,7 @@ pub(super) struct Evidence {
     pub is_precise: bool,
     /// The standard deviation of the position is at most half of `sure_spread_m`.
     pub is_twice_as_precise: bool,
-    /// The agreement is as large as usual here.
+    /// The agreement is nearly as large as usual here, see `AgreementMonitor::is_usual`.
     pub is_usual: bool,
 }
 
