@@ -494,6 +494,40 @@ fn a_localization_that_is_interrupted_after_its_search_keeps_all_frames_as_the_f
 }
 
 #[test]
+fn a_localization_that_finishes_after_a_signal_has_the_poses_of_its_first_frames() {
+    let recording = Recording::street(4);
+    recording.fpmcl("build-map").succeeds();
+    let late = [
+        "--set=tracking_loss.confirming_updates=2",
+        "--set=tracking_loss.sure_agreement=1",
+        "--set=output.plots=False",
+    ];
+    let scan = PipedScan::new(&recording, 3);
+    // The signal comes while the last frame is localized, or shortly before or after it.
+    for delay_ms in (0..60).step_by(4) {
+        let opened = scan.opened();
+        let mut child = start(&recording, &[LOCALIZE, &late, &["--force"]].concat());
+        let mut pipe = wait(&opened, &mut child);
+        pipe.write_all(&scan.bytes).unwrap();
+        drop(pipe);
+        thread::sleep(Duration::from_millis(delay_ms));
+        let ended = child.try_wait().unwrap();
+        if ended.is_none() {
+            send("-TERM", &child);
+        }
+        let stderr = read_until(&mut stderr_of(&mut child), None);
+        if child.wait().unwrap().code() != Some(130) {
+            let path = recording.path("results/localization.npz");
+            let results = LocalizationResults::read(&path).unwrap();
+            assert!(
+                results.trajectory_in_space.is_some(),
+                "{delay_ms} ms: {stderr}"
+            );
+        }
+    }
+}
+
+#[test]
 fn a_drive_that_is_interrupted_keeps_its_frames_also_while_no_scan_arrives() {
     let recording = Recording::street(12);
     recording.fpmcl("build-map").succeeds();
@@ -519,6 +553,40 @@ fn a_drive_that_is_interrupted_keeps_its_frames_also_while_no_scan_arrives() {
         let kept = format!("interrupted; {frames} of 12 frames are localized and kept in results/");
         assert!(stderr.contains(&kept), "{stderr}");
         assert_eq!(temporary_files(&recording, "results"), [""; 0]);
+    }
+}
+
+#[test]
+fn scans_that_wait_when_a_drive_is_interrupted_count_as_dropped() {
+    let recording = Recording::street(40);
+    recording.fpmcl("build-map").succeeds();
+    let live = [
+        "live",
+        "localization.yml",
+        "--backend=cpu",
+        "--replay=velodyne",
+    ];
+    let fast = ["--rate=1000", "--queue=1000", "--set=output.plots=False"];
+    let mut child = start(&recording, &[&live[..], &fast].concat());
+    let mut reader = stderr_of(&mut child);
+    read_until(&mut reader, Some("the scan agrees with the map"));
+    let stderr = stopped_in_time_with("-TERM", child, reader);
+    // On a machine under load the process ends before it writes the report.
+    if recording.path("results/report.json").exists() {
+        let live = &common::json(&recording.path("results/report.json"))["live"];
+        let count = |value: &serde_json::Value| value.as_u64().unwrap();
+        let localized: u64 = live["states"]
+            .as_object()
+            .unwrap()
+            .values()
+            .map(count)
+            .sum();
+        let lost = count(&live["dropped"]) + count(&live["rejected"]);
+        assert_eq!(count(&live["received"]), localized + lost, "{stderr}");
+        assert!(
+            stderr.contains(&format!("interrupted; {localized} of 40 frames")),
+            "{stderr}"
+        );
     }
 }
 

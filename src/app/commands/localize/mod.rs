@@ -117,17 +117,17 @@ pub fn run_with(
 ) -> Result<Report> {
     let run = Mutex::new(Run::new(&opened, claims)?);
     let recorded = || run.lock().unwrap_or_else(PoisonError::into_inner);
-    context.interrupt.supervise(
+    let is_unfilled = context.interrupt.supervise(
         || {
             localize(&opened, motion, &recorded)?;
-            let searched = if context.interrupt.requested() {
-                None
-            } else {
-                let run = recorded();
-                (run.searched()).map(|searched| (searched, run.frames(&opened)))
-            };
+            let searched = recorded().searched();
+            let is_unfilled = searched.is_some() && context.interrupt.requested();
             let filled = searched
-                .map(|(searched, frames)| fill_back(&opened, &frames, &searched))
+                .filter(|_| !is_unfilled)
+                .map(|searched| {
+                    let frames = recorded().frames(&opened);
+                    fill_back(&opened, &frames, &searched)
+                })
                 .transpose()?;
             let mut run = recorded();
             if let Some(filled) = filled.flatten() {
@@ -136,7 +136,7 @@ pub fn run_with(
             run.complete()?;
             write_results(&opened, &mut run)?;
             context.interrupt.keeps(run.kept(&opened));
-            anyhow::Ok(())
+            anyhow::Ok(is_unfilled && run.is_complete(&opened))
         },
         || {
             let mut run = recorded();
@@ -148,7 +148,8 @@ pub fn run_with(
         },
     )?;
     let mut run = run.into_inner().unwrap_or_else(PoisonError::into_inner);
-    if run.results.len() > MOST_FRAMES_AT_EXIT {
+    // A result without the poses of its first frames is not finished.
+    if is_unfilled || run.results.len() > MOST_FRAMES_AT_EXIT {
         context.interrupt.check()?;
     }
     write_trajectories(&opened, &run)?;
