@@ -99,7 +99,12 @@ impl<T> Inbox<T> {
 
     /// Whether no scan waits.
     pub fn is_empty(&self) -> bool {
-        self.content().waiting.is_empty()
+        self.len() == 0
+    }
+
+    /// Number of scans that wait.
+    pub fn len(&self) -> usize {
+        self.content().waiting.len()
     }
 
     /// Whether the reception has ended.
@@ -145,6 +150,7 @@ mod tests {
         for capacity in 1..4 {
             let inbox = Inbox::new(capacity);
             (0..10).for_each(|scan| inbox.push(scan));
+            assert_eq!((inbox.len(), inbox.is_empty()), (capacity, false));
             let newest: Vec<u32> = (10 - capacity as u32..10).collect();
             assert_eq!(taken(&inbox), newest);
             assert_eq!(

@@ -86,9 +86,11 @@ impl Drive<'_, '_> {
         let unreadable = unreadable.into_inner();
         let rejected = summary.rejected + unreadable;
         let mut run = (self.recorded)();
-        let dropped = inbox.dropped();
-        run.missed = (dropped + rejected) as usize;
+        run.missed = (inbox.dropped() + rejected) as usize;
+        // Those that a signal has left waiting are lost to a robot, and not to a recording.
+        let dropped = inbox.dropped() + inbox.len() as u64;
         if self.opened.is_driving() {
+            run.missed += inbox.len();
             run.results.selected = Some(run.results.len() + run.missed);
         }
         run.live = Some(LiveSummary {
