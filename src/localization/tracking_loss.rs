@@ -10,8 +10,8 @@
 //!
 //! A place that was found by a search is confirmed by the share of one scan if nearly all of its beams agree, else by
 //! those of several scans in turn: many places agree with a single scan of few beams. A pose that was uncertain in
-//! between, as along a tunnel, is confirmed by a share that is not below the slow average, or by one of at least `sure_agreement` that is nearer
-//! to that average than to a loss. Where nothing is compared, nothing is confirmed.
+//! between, as along a tunnel, is confirmed by a share that is not below the slow average, or by one of at least
+//! `sure_agreement` that is nearer to that average than to a loss. Where nothing is compared, nothing is confirmed.
 //!
 //! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) averages the
 //! likelihood instead; here traffic in front of the map must not raise an alarm: beams that end far in front of the map are
