@@ -145,8 +145,12 @@ impl TestWorld {
     /// The range image at a pose.
     pub fn scan(&self, pose: &Pose2) -> RangeImage {
         let lifted = self.ground.lift(pose, &SensorAttitude::default());
-        let map_from_lidar = lifted.unwrap().unwrap();
-        let ranges = self.ranges(&map_from_lidar, &self.model.directions());
+        self.scan_in_space(&lifted.unwrap().unwrap())
+    }
+
+    /// The scan of a sensor at a pose in space.
+    pub fn scan_in_space(&self, map_from_lidar: &Pose3) -> RangeImage {
+        let ranges = self.ranges(map_from_lidar, &self.model.directions());
         let limited = ranges
             .into_iter()
             .map(|range| {

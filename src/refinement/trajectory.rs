@@ -27,7 +27,7 @@ use crate::ground::GroundConfig;
 use crate::lidar::{Beam, Motion, RangeImage, Scan};
 use crate::localization::observation::{ObservationConfig, agreement, choose_beams, ranges_along};
 use crate::localization::{Estimate, ScanPreparation, State, TrackingLossConfig};
-use crate::map::{Map, MapError, SensorAttitude};
+use crate::map::{GroundPatch, Map, MapError, SensorAttitude};
 use crate::random::{Generator, stream};
 use crate::rendering::{RangeRenderer, RenderError};
 use crate::sensor::{Sensor, SensorError};
@@ -57,8 +57,11 @@ impl Validate for RefinerConfig {
 /// An estimate to refine.
 #[derive(Clone, Debug, PartialEq)]
 pub struct InitialEstimate {
-    /// `map_from_lidar`.
+    /// `map_from_lidar` seen from above.
     pub pose: Pose2,
+    /// `map_from_lidar` in space, from which a tracked frame has the height and the attitude of the sensor; `None` for those
+    /// of the frame before, else of the ground in the scan.
+    pub map_from_lidar: Option<Pose3>,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²]; `None` for standard
     /// deviations of 0.2 m and 0.6 degrees.
     pub covariance: Option<Matrix3<f64>>,
@@ -76,6 +79,7 @@ impl InitialEstimate {
     pub fn tracked(pose: Pose2) -> Self {
         Self {
             pose,
+            map_from_lidar: None,
             covariance: None,
             state: State::Tracking,
             motion: None,
@@ -97,6 +101,7 @@ impl InitialEstimate {
         let motion = |row: usize| Motion::along(driven.as_ref()?, times_s?, row);
         let rough = |(row, pose): (usize, &Pose2)| Self {
             pose: *pose,
+            map_from_lidar: None,
             covariance: Some(Matrix3::from_diagonal(&variances.into())),
             state: State::Tracking,
             motion: motion(row),
@@ -105,21 +110,24 @@ impl InitialEstimate {
         poses.iter().enumerate().map(rough).collect()
     }
 
-    /// The estimates of a filter with their covariances and states, and the increments of the odometry
-    /// `previous_from_current`, of which the first is ignored. Where the times [s] are known, scans are deskewed by the
-    /// estimates around them, if these were tracked, else by the odometry.
+    /// The estimates of a filter, seen from above and, where known, in space, with their covariances and states, and the
+    /// increments of the odometry `previous_from_current`, of which the first is ignored. Where the times [s] are known, scans
+    /// are deskewed by the estimates around them, if these were tracked, else by the odometry.
     pub fn from_filter(
         estimates: &[Pose2],
+        map_from_lidar: Option<&[Pose3]>,
         covariances: Option<&[Matrix3<f64>]>,
         states: &[State],
         increments: &[Option<Pose2>],
         times_s: Option<&[f64]>,
     ) -> Vec<Self> {
-        let in_space = estimates.iter().map(|pose| pose3_from_pose2(pose, 0.0));
-        let in_space: Vec<Pose3> = in_space.collect();
+        let level = estimates.iter().map(|pose| pose3_from_pose2(pose, 0.0));
+        let in_space = map_from_lidar.map_or_else(|| level.collect(), <[Pose3]>::to_vec);
         let driven = Self::driven(increments);
         let motion = |row: usize| {
-            let around = row.saturating_sub(1)..=(row + 1).min(estimates.len() - 1);
+            // Those from which the motion is found, three also at the ends.
+            let middle = row.clamp(1, estimates.len().saturating_sub(2).max(1));
+            let around = middle - 1..=(middle + 1).min(estimates.len() - 1);
             let is_known = states[around].iter().all(|it| *it == State::Tracking);
             let poses = if is_known {
                 Some(&in_space)
@@ -130,6 +138,7 @@ impl InitialEstimate {
         };
         let initial = |(row, pose): (usize, &Pose2)| Self {
             pose: *pose,
+            map_from_lidar: map_from_lidar.map(|all| all[row]),
             covariance: covariances.map(|all| all[row]),
             state: states[row],
             motion: motion(row),
@@ -156,6 +165,7 @@ impl From<&Estimate> for InitialEstimate {
     fn from(estimate: &Estimate) -> Self {
         Self {
             pose: estimate.pose,
+            map_from_lidar: Some(estimate.map_from_lidar),
             covariance: Some(estimate.covariance),
             state: estimate.state,
             motion: estimate.motion,
@@ -347,16 +357,18 @@ impl TrajectoryRefiner {
         let mut rng = stream(self.seed, (self.forgotten + self.frames.len()) as u64);
         let image = self.preparation.range_image(scan, estimate.motion.as_ref());
         let previous = self.frames.last();
+        let known = self.attitude_and_level_of(estimate)?;
+        let level_before_m = previous
+            .filter(|_| estimate.state != State::Lost)
+            .and_then(|previous| previous.level_m);
         let mut frame = FrameResult {
             pose: estimate.pose,
             map_from_lidar: None,
             covariance: estimate.covariance(),
             state: estimate.state,
             change: None,
-            attitude: self.initial_attitude(&image),
-            level_m: previous
-                .filter(|_| estimate.state != State::Lost)
-                .and_then(|previous| previous.level_m),
+            attitude: known.map_or_else(|| self.initial_attitude(&image), |(attitude, _)| attitude),
+            level_m: known.map(|(_, level_m)| level_m).or(level_before_m),
         };
         let is_tracked = frame.is_tracked();
         if is_tracked && !self.config.refinement.is_wide(&frame.covariance) {
@@ -448,6 +460,23 @@ impl TrajectoryRefiner {
             self.frames[row] = placed;
         }
         Ok(())
+    }
+
+    /// Attitude of the sensor above the mapped ground, and the height of that ground [m], where the estimate of a tracked
+    /// frame is known in space.
+    fn attitude_and_level_of(
+        &self,
+        estimate: &InitialEstimate,
+    ) -> Result<Option<(SensorAttitude, f64)>, RenderError> {
+        let is_tracked = estimate.state == State::Tracking;
+        let Some(map_from_lidar) = estimate.map_from_lidar.filter(|_| is_tracked) else {
+            return Ok(None);
+        };
+        let place = map_from_lidar.translation;
+        let levels = self.map.ground.levels_at(place.x, place.y)?;
+        let below = levels.iter().rfind(|patch| patch.height_m < place.z);
+        let known = |patch: &GroundPatch| (patch.attitude_of(&map_from_lidar), patch.height_m);
+        Ok(below.or(levels.first()).map(known))
     }
 
     /// Attitude of the sensor in the next frame. That of a registered frame is more accurate than the
@@ -699,9 +728,12 @@ mod tests {
 
     use super::super::refiner::Method;
     use super::*;
+    use nalgebra::UnitQuaternion;
+
+    use crate::geometry::pose2_from_pose3;
     use crate::lidar::LidarModel;
     use crate::map::world_for_tests::TestWorld;
-    use crate::map::{GroundPatch, MapCache, MapOptions, MappingPath};
+    use crate::map::{MapCache, MapOptions, MappingPath};
     use crate::rendering::Backend;
 
     fn sensor() -> Sensor {
@@ -780,6 +812,7 @@ mod tests {
             let covariance = Matrix3::from_diagonal(&Vector3::new(0.25, 0.25, 0.0625));
             let expected = InitialEstimate {
                 pose: poses[row],
+                map_from_lidar: None,
                 covariance: Some(covariance),
                 state: State::Tracking,
                 motion: Motion::along(&driven, &times_s, row),
@@ -812,21 +845,41 @@ mod tests {
         let estimated: Vec<Pose3> = (poses.iter())
             .map(|pose| pose3_from_pose2(pose, 0.0))
             .collect();
-        let given = Some(&covariances[..]);
-        let found =
-            InitialEstimate::from_filter(&poses, given, &states, &increments, Some(&times_s));
+        let (given, times) = (Some(&covariances[..]), Some(&times_s[..]));
+        let found = InitialEstimate::from_filter(&poses, None, given, &states, &increments, times);
         assert_eq!(found.len(), poses.len());
         for (row, found) in found.into_iter().enumerate() {
-            let is_known = row == 0 || row > 3;
+            let is_known = row > 3;
             let path = if is_known { &estimated } else { &driven };
             let expected = InitialEstimate {
                 pose: poses[row],
+                map_from_lidar: None,
                 covariance: Some(covariances[row]),
                 state: states[row],
                 motion: Motion::along(path, &times_s, row),
                 increment: (row > 0).then_some(step),
             };
             assert_eq!(found, expected, "{row}");
+        }
+        // Tilted, and rolling on the way.
+        let roll = |row: usize| UnitQuaternion::from_euler_angles(0.01 * row as f64, 0.2, 0.0);
+        let in_space = poses
+            .iter()
+            .enumerate()
+            .map(|(row, pose)| pose3_from_pose2(pose, 1.7) * UnitQuaternion::from(roll(row)));
+        let in_space: Vec<Pose3> = in_space.collect();
+        let found = InitialEstimate::from_filter(
+            &poses,
+            Some(&in_space),
+            given,
+            &states,
+            &increments,
+            times,
+        );
+        for (row, found) in found.iter().enumerate() {
+            assert_eq!(found.map_from_lidar, Some(in_space[row]));
+            let path = if row > 3 { &in_space } else { &driven };
+            assert_eq!(found.motion, Motion::along(path, &times_s, row), "{row}");
         }
     }
 
@@ -896,6 +949,81 @@ mod tests {
                     assert_eq!(field.at(x, 7.0), 1.5, "{pose_m} {x}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_frame_begins_as_its_estimate_in_space_is_held_and_not_as_the_frame_before() {
+        let world = TestWorld::street();
+        let held = |x: f64, attitude: SensorAttitude| {
+            let lifted = world.ground.lift(&world.pose_at(x, 0.0, 0.0), &attitude);
+            lifted.unwrap().unwrap()
+        };
+        let tilted = SensorAttitude {
+            height_m: 1.2,
+            roll_rad: 0.3,
+            pitch_rad: -0.25,
+        };
+        let truth = [
+            held(10.0, SensorAttitude::default()),
+            held(11.0, tilted),
+            held(12.0, SensorAttitude::default()),
+        ];
+        let agreements = |is_known: bool| {
+            let mut refiner =
+                TrajectoryRefiner::new(&world.map(), &sensor(), RefinerConfig::default(), 0)
+                    .unwrap();
+            truth.map(|pose| {
+                let scan = Scan {
+                    points: world.scan_in_space(&pose).points,
+                    ..Scan::default()
+                };
+                let estimate = InitialEstimate {
+                    map_from_lidar: is_known.then_some(pose),
+                    ..InitialEstimate::tracked(pose2_from_pose3(&pose))
+                };
+                let frame = refiner.add(&scan, &estimate).unwrap();
+                frame.change.and_then(|change| change.agreement[0])
+            })
+        };
+        let found = agreements(true).map(Option::unwrap);
+        assert!(found.iter().all(|&share| share > 0.95), "{found:?}");
+        let found = agreements(false).map(Option::unwrap);
+        assert!(found[1] < 0.8, "{found:?}");
+    }
+
+    #[test]
+    fn of_several_levels_a_sensor_is_above_the_one_below_it() {
+        let mut mesh = TriangleMesh::default();
+        for height_m in [0.0, 6.0] {
+            let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
+            mesh.append(&TriangleMesh {
+                vertices: corners.map(|(x, y)| glam::Vec3::new(x, y, height_m)).into(),
+                triangles: vec![[0, 1, 2], [0, 2, 3]],
+                colors: vec![[255, 0, 0]; 4],
+                ..TriangleMesh::default()
+            });
+        }
+        let at = |z: f64| Pose3::translation(1.0, 2.0, z);
+        let path = MappingPath {
+            map_from_lidar: vec![at(1.0)],
+            ..MappingPath::default()
+        };
+        let map = Map::new(mesh, path, &MapOptions::default()).unwrap();
+        let refiner = TrajectoryRefiner::new(&map, &sensor(), RefinerConfig::default(), 0).unwrap();
+        for (z, expected_m) in [(-0.5, 0.0), (0.5, 0.0), (5.5, 0.0), (6.5, 6.0), (9.0, 6.0)] {
+            let estimate = InitialEstimate {
+                map_from_lidar: Some(at(z)),
+                ..InitialEstimate::tracked(pose2_from_pose3(&at(z)))
+            };
+            let known =
+                |estimate: &InitialEstimate| refiner.attitude_and_level_of(estimate).unwrap();
+            let (attitude, level_m) = known(&estimate).unwrap();
+            assert_relative_eq!(level_m, expected_m, epsilon = 1e-6);
+            assert_relative_eq!(attitude.height_m, z - expected_m, epsilon = 1e-6);
+            // Where the filter is not sure, it does not know how the sensor is held either.
+            let state = State::Searching;
+            assert!(known(&InitialEstimate { state, ..estimate }).is_none());
         }
     }
 
@@ -1139,13 +1267,7 @@ mod tests {
             points,
             ..Scan::default()
         };
-        let estimate = InitialEstimate {
-            pose: truth * Pose2::translation(0.05, 0.05),
-            covariance: None,
-            state: State::Tracking,
-            motion: None,
-            increment: None,
-        };
+        let estimate = InitialEstimate::tracked(truth * Pose2::translation(0.05, 0.05));
         let refined = refiner.add(&scan, &estimate).unwrap();
         let off_m = (refined.pose.translation.vector - truth.translation.vector).norm();
         assert!(off_m < 0.01, "{off_m}");

@@ -278,6 +278,10 @@ fn without_rounding_errors(mut results: LocalizationResults) -> LocalizationResu
     };
     (results.estimates.iter_mut().flatten()).for_each(on_lattice);
     (results.odometry.iter_mut().flatten()).for_each(on_lattice);
+    for pose in results.estimates_in_space.iter_mut().flatten() {
+        let rotation = pose.rotation.scaled_axis().map(rounded);
+        *pose = Pose3::new(pose.translation.vector.map(rounded), rotation);
+    }
     results
 }
 
@@ -292,8 +296,21 @@ fn initial_estimates(
     let states: Vec<State> = (0..estimates.len())
         .map(|row| state(row).unwrap_or(State::Tracking))
         .collect();
+    // Those of a trajectory may have any height.
+    let is_of_filter = results.covariances.is_some();
+    let in_space = results
+        .estimates_in_space
+        .as_deref()
+        .filter(|_| is_of_filter);
     let (covariances, times_s) = (results.covariances.as_deref(), results.times_s.as_deref());
-    InitialEstimate::from_filter(estimates, covariances, &states, increments, times_s)
+    InitialEstimate::from_filter(
+        estimates,
+        in_space,
+        covariances,
+        &states,
+        increments,
+        times_s,
+    )
 }
 
 /// Refines all frames and smooths them; also returns the runtime of each frame [s].

@@ -34,6 +34,7 @@ pub fn fill_back(
     let increments: Vec<Option<Pose2>> = odometry.iter().copied().map(Some).collect();
     let starts = InitialEstimate::from_filter(
         estimates,
+        searched.estimates_in_space.as_deref(),
         searched.covariances.as_deref(),
         &states.collect::<Vec<_>>(),
         &increments,
