@@ -272,24 +272,48 @@ pub fn ranges_along(
     Ok(rows.pop().unwrap_or_default())
 }
 
-/// Returns the share of agreeing beams, whose measured and rendered ranges differ by the tolerance at most, among those that
-/// count; `None` if fewer than 30 count. Beams along which the map has no surface do not count, nor do those that end far in
-/// front of it, on traffic; those that end within a quarter of the range in front of it show a wrong pose, or ranges that
-/// are too short.
+/// Whether a beam agrees with the map: its measured and its rendered range differ by the tolerance at most. `None` if it does
+/// not count: beams along which the map has no surface, and those that end far in front of it, on traffic. Those that end within
+/// a quarter of the range in front of it disagree: they show a wrong pose, or ranges that are too short.
+fn agrees(beam: &Beam, rendered_m: f32, tolerance_m: f32) -> Option<bool> {
+    /// Largest distance of a return to the surface behind it that counts, as a share of the range of the surface.
+    const NEAR: f32 = 0.25;
+    let excess_m = beam.range_m - rendered_m;
+    let is_traffic = excess_m < -tolerance_m && -excess_m > NEAR * rendered_m;
+    let counts = rendered_m != f32::INFINITY && !is_traffic;
+    counts.then(|| excess_m.abs() <= tolerance_m)
+}
+
+/// Returns the share of agreeing beams among those that count; `None` if fewer than 30 count.
 pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option<f64> {
     /// Smallest number of beams.
     const MIN_BEAMS: usize = 30;
-    /// Largest distance of a return to the surface behind it that counts, as a share of the range of the surface.
-    const NEAR: f32 = 0.25;
     let (mut on, mut counted) = (0_usize, 0_usize);
-    let reaching = (beams.iter().zip(rendered_m)).filter(|(_, m)| **m != f32::INFINITY);
-    for (beam, rendered_m) in reaching {
-        let excess_m = beam.range_m - rendered_m;
-        let is_traffic = excess_m < -tolerance_m && -excess_m > NEAR * rendered_m;
-        counted += usize::from(!is_traffic);
-        on += usize::from(excess_m.abs() <= tolerance_m);
+    for (beam, &rendered_m) in beams.iter().zip(rendered_m) {
+        let agrees = agrees(beam, rendered_m, tolerance_m);
+        counted += usize::from(agrees.is_some());
+        on += usize::from(agrees == Some(true));
     }
     (counted >= MIN_BEAMS).then(|| on as f64 / counted as f64)
+}
+
+/// Whether beams agree with the map much better at one pose than at another, by its ranges along them there and here. Of those that
+/// count at both poses, gains less losses are at least half of what disagrees here, and more than chance by six standard deviations
+/// (McNemar, *Note on the sampling error of the difference between correlated proportions or percentages*, 1947).
+pub fn agrees_better(beams: &[Beam], [there_m, here_m]: [&[f32]; 2], tolerance_m: f32) -> bool {
+    const SIGMAS: f64 = 6.0;
+    let (mut gained, mut lost, mut disagreeing) = (0.0, 0.0, 0.0);
+    for (beam, (&there_m, &here_m)) in beams.iter().zip(there_m.iter().zip(here_m)) {
+        let at = |rendered_m: f32| agrees(beam, rendered_m, tolerance_m);
+        match (at(there_m), at(here_m)) {
+            (Some(true), Some(false)) => gained += 1.0,
+            (Some(false), Some(true)) => lost += 1.0,
+            _ => {}
+        }
+        disagreeing += f64::from(u8::from(at(here_m) == Some(false) && at(there_m).is_some()));
+    }
+    let gain: f64 = gained - lost;
+    gain >= 0.5 * disagreeing && gain > SIGMAS * f64::sqrt(gained + lost)
 }
 
 /// Returns the beams that end above the road, which distinguish one place from another.
@@ -488,6 +512,39 @@ mod tests {
         let mut rendered_m = [4.0; 90];
         rendered_m[40..].fill(10.2);
         assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(50.0 / 90.0));
+    }
+
+    #[test]
+    fn a_pose_is_much_better_by_the_beams_that_count_at_both() {
+        let beams = [Beam {
+            direction: Vec3::X,
+            range_m: 10.0,
+        }; 1000];
+        // Numbers of beams in turn, with the ranges of the map there and here.
+        let is_better = |parts: &[(usize, [f32; 2])]| {
+            let along = |pose: usize| {
+                let of_part = |&(count, ranges_m): &(usize, [f32; 2])| vec![ranges_m[pose]; count];
+                parts.iter().flat_map(of_part).collect::<Vec<f32>>()
+            };
+            let [there, here] = [0, 1].map(along);
+            assert!(there.len() <= beams.len());
+            agrees_better(&beams, [&there, &here], 0.3)
+        };
+        let (on, off, nothing) = (10.0, 9.0, f32::INFINITY);
+        let (gained, lost) = ([on, off], [off, on]);
+        let (both, neither) = ([on, on], [off, off]);
+        // Six standard deviations of chance: 36 beams are not enough.
+        assert!(!is_better(&[(900, both), (36, gained)]));
+        assert!(is_better(&[(900, both), (37, gained)]));
+        assert!(!is_better(&[(800, both), (100, gained), (33, lost)]));
+        assert!(is_better(&[(800, both), (100, gained), (22, lost)]));
+        // Half of those that disagree here.
+        assert!(is_better(&[(700, both), (100, gained), (100, neither)]));
+        assert!(!is_better(&[(700, both), (100, gained), (101, neither)]));
+        assert!(!is_better(&[(1000, both)]) && !is_better(&[(900, lost)]));
+        // Beams that hit nothing there are no gain.
+        assert!(!is_better(&[(500, both), (500, [nothing, off])]));
+        assert!(!is_better(&[(500, both), (500, [on, nothing])]));
     }
 
     #[test]

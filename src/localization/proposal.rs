@@ -100,6 +100,17 @@ impl Gaussian {
         deviates.iter().map(pose).collect()
     }
 
+    /// The same, so wide that a pose is a standard deviation from its mean, and as wide as before across; `None` where
+    /// rounding leaves no covariance.
+    pub fn widened_to(&self, pose: &Pose2) -> Option<Self> {
+        let root = self.cholesky.l();
+        let offset = deviation(pose, &self.mean);
+        Self::new(
+            self.mean,
+            root * root.transpose() + offset * offset.transpose(),
+        )
+    }
+
     /// Normalized product with another one.
     pub fn fused(&self, other: &Self) -> Option<Self> {
         let information = self.cholesky.inverse() + other.cholesky.inverse();
@@ -160,6 +171,22 @@ mod tests {
         let fused = narrow.fused(&wide).unwrap();
         assert_relative_eq!(fused.mean, narrow.mean, epsilon = 1e-9);
         assert_relative_eq!(covariance(&fused), covariance(&narrow), epsilon = 1e-9);
+    }
+
+    #[test]
+    fn a_gaussian_that_is_widened_to_a_pose_leaves_it_to_a_precise_one_in_its_direction_alone() {
+        let prior = gaussian(0.0, 0.2, 0.01);
+        let pose = Pose2::new(prior.mean.translation.vector + Vector2::new(0.5, 0.0), 0.2);
+        let widened = prior.widened_to(&pose).unwrap();
+        assert_relative_eq!(widened.squared_distance(&pose), 1.0, epsilon = 1e-3);
+        // Of (x, y, heading): x is known, the rest is not.
+        let known = Vector3::new(1e-8, 1e6, 1e6);
+        let measured = Gaussian::new(pose, Matrix3::from_diagonal(&known)).unwrap();
+        let fused = widened.fused(&measured).unwrap();
+        assert_relative_eq!(fused.mean, pose, epsilon = 1e-3);
+        let across = covariance(&fused).fixed_view::<2, 2>(1, 1).into_owned();
+        let before = covariance(&prior).fixed_view::<2, 2>(1, 1).into_owned();
+        assert_relative_eq!(across, before, max_relative = 1e-6, epsilon = 1e-12);
     }
 
     #[test]

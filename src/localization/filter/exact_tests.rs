@@ -31,6 +31,7 @@ fn tracking(config: LocalizerConfig, pose: Pose2, covariance: Matrix3<f64>) -> P
         pose,
         covariance,
         is_narrow: true,
+        refuted: false,
     };
     filter
 }
@@ -496,9 +497,10 @@ fn particles_are_resampled_where_few_are_effective_and_where_fewer_track_a_pose(
 fn the_motion_between_updates_is_known_if_the_pose_was_certain_at_both() {
     let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
     let step = Pose2::new(Vector2::new(1.0, 0.1), 0.02);
-    let motion = |was_narrow: bool, apart_m: f64| {
+    let motion_of = |was_narrow: bool, apart_m: f64, [refuted, refutes]: [bool; 2]| {
         let mut filter = tracking(LocalizerConfig::of_test(6), start, Matrix3::zeros());
         filter.updated.is_narrow = was_narrow;
+        filter.updated.refuted = refuted;
         let sides = [-0.5, 0.5].map(|side| start * step * Pose2::translation(side * apart_m, 0.0));
         filter.particles = ParticleSet::uniform(sides);
         let update = Update {
@@ -506,14 +508,49 @@ fn the_motion_between_updates_is_known_if_the_pose_was_certain_at_both() {
             beams: vec![],
             attitude: SensorAttitude::default(),
             pose: None,
+            refutes,
         };
         filter.updated_estimate(&update).unwrap();
         filter.last_motion.map(|last| last.increment)
     };
+    let motion = |was_narrow: bool, apart_m: f64| motion_of(was_narrow, apart_m, [false; 2]);
     assert_relative_eq!(motion(true, 0.01).unwrap(), step, epsilon = 1e-9);
+    // A correction of the prediction is no motion, but a second one in turn is.
+    assert_eq!(motion_of(true, 0.01, [false, true]), None);
+    assert!(motion_of(true, 0.01, [true, true]).is_some());
     assert_eq!(motion(false, 0.01), None);
     assert_eq!(motion(true, 4.0), None);
     assert_eq!(motion(false, 4.0), None);
+}
+
+#[test]
+fn a_place_is_not_tracked_where_the_scan_fits_much_better_next_to_it() {
+    let world = TestWorld::street();
+    let truth = world.pose_at(12.0, 0.2, 0.05);
+    let scan = world.scan(&truth);
+    let mut config = LocalizerConfig::of_test(6);
+    // What agrees there by chance confirms a place.
+    config.tracking_loss.sure_agreement = 0.2;
+    config.tracking_loss.min_agreement = 0.1;
+    for (aside_m, expected) in [(0.0, State::Tracking), (0.4, State::Searching)] {
+        let pose = truth * Pose2::translation(0.0, aside_m);
+        let mut filter = tracking(config.clone(), pose, Matrix3::zeros());
+        filter.phase = Phase::Searching {
+            search: Search::Around,
+            updates: 0,
+        };
+        let attitude = SensorAttitude::default();
+        let mut rng = StdRng::seed_from_u64(1);
+        let still = Odometry::Increment(Pose2::identity());
+        filter.pending = None;
+        let estimate = filter.step(still, &scan, &attitude, &mut rng).unwrap();
+        assert_eq!(estimate.state, expected, "{:?}", estimate.agreement);
+        // The place is found, and its pose right at once; the next scan confirms it, also of a car that stands.
+        assert!(filter.phase.is_tracking());
+        assert!(deviation(&estimate.pose, &truth).xy().norm() < 0.01);
+        let next = filter.step(still, &scan, &attitude, &mut rng).unwrap();
+        assert_eq!(next.state, State::Tracking);
+    }
 }
 
 #[test]

@@ -18,6 +18,9 @@
 //! Twice as precise, since in a tunnel the standard deviation of the position crosses its limit again and again by the noise of
 //! the walls. A scan that determines the position reduces it to centimetres at once.
 //!
+//! A pose counts as not precise where the scan refutes the prediction, or the pose that the search found: the next scan has to
+//! confirm it.
+//!
 //! Thresholds: [`tracking_loss`](crate::localization::tracking_loss), [`convergence`](crate::localization::convergence),
 //! and for what is searched [`places`](crate::localization::places).
 //! Without panoramas the filter stays `Lost` until a pose is confirmed. What is reported, see [`Phase::reported`]:
@@ -79,6 +82,17 @@ pub(super) struct Evidence {
     pub is_twice_as_precise: bool,
     /// The agreement is nearly as large as usual here, see `AgreementMonitor::is_usual`.
     pub is_usual: bool,
+}
+
+impl Evidence {
+    /// The same where the scan refutes the prediction: how wide the distribution is says nothing.
+    pub fn refuted(self) -> Self {
+        Self {
+            is_precise: false,
+            is_twice_as_precise: false,
+            ..self
+        }
+    }
 }
 
 impl Search {

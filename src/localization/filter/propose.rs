@@ -8,7 +8,9 @@ use super::reweight::Update;
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
-use crate::localization::observation::{choose_beams, costs_of_scan};
+use crate::localization::observation::{
+    above_road, agreement, agrees_better, choose_beams, costs_of_scan, ranges_along,
+};
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::proposal::{Gaussian, regular};
@@ -29,6 +31,8 @@ pub(super) struct Posterior {
     /// Height of the ground [m].
     level_m: f64,
     attitude: SensorAttitude,
+    /// Whether the registration refutes the prediction.
+    refutes: bool,
 }
 
 impl ParticleFilter {
@@ -68,7 +72,8 @@ impl ParticleFilter {
     }
 
     /// Registers the scan with the map, from `start` if that is plausible, else from the prediction, and fuses the result with the
-    /// prediction; `None` while the distribution is wide, where registration fails, and where its result is implausible.
+    /// prediction; `None` while the distribution is wide, where registration fails, and where its result is implausible and
+    /// does not refute the prediction.
     pub(super) fn propose(
         &self,
         scan: &RangeImage,
@@ -76,8 +81,33 @@ impl ParticleFilter {
         start: Option<Pose3>,
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
+        if !self.phase.is_tracking() {
+            return Ok(None);
+        }
+        self.fused(scan, attitude, start, rng)
+    }
+
+    /// Distribution of a pose next to the one to which the particles have converged, where the scan refutes this one.
+    pub(super) fn better_next_to_particles(
+        &self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Posterior>, RenderError> {
+        let posterior = self.fused(scan, attitude, None, rng)?;
+        Ok(posterior.filter(|posterior| posterior.refutes))
+    }
+
+    /// As [`propose`](Self::propose), whatever the phase.
+    fn fused(
+        &self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        start: Option<Pose3>,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Posterior>, RenderError> {
         let config = &self.config.proposal;
-        if !config.scan || !self.phase.is_tracking() {
+        if !config.scan {
             return Ok(None);
         }
         let mean = self.particles.mean();
@@ -101,11 +131,20 @@ impl ParticleFilter {
             return Ok(None);
         };
         let pose = pose2_from_pose3(&found.map_from_lidar);
-        let measured = Gaussian::new(pose, regular(&found.planar_covariance()));
-        let Some(measured) = measured.filter(|_| is_plausible(&pose)) else {
+        let Some(measured) = Gaussian::new(pose, regular(&found.planar_covariance())) else {
             return Ok(None);
         };
-        let Some(gaussian) = prior.fused(&measured) else {
+        let predicted = patch.lift(&mean, attitude);
+        let refutes = !is_plausible(&pose);
+        if refutes && !self.is_refuted(&predicted, &found.map_from_lidar, (&beams, attitude))? {
+            return Ok(None);
+        }
+        let prior = if refutes {
+            prior.widened_to(&pose)
+        } else {
+            Some(prior)
+        };
+        let Some(gaussian) = prior.and_then(|prior| prior.fused(&measured)) else {
             return Ok(None);
         };
         let attitude = patch.attitude_of(&found.map_from_lidar);
@@ -118,7 +157,26 @@ impl ParticleFilter {
             mean_cost_m: costs_m[0],
             level_m: patch.height_m,
             attitude,
+            refutes,
         }))
+    }
+
+    /// Whether a registered pose shows that the predicted one is wrong, as after a place that was confirmed by a pose next to
+    /// the right one: nearly all beams above the road agree with the map there, and many more than at the prediction.
+    fn is_refuted(
+        &self,
+        predicted: &Pose3,
+        registered: &Pose3,
+        (beams, attitude): (&[Beam], &SensorAttitude),
+    ) -> Result<bool, RenderError> {
+        let config = &self.config.tracking_loss;
+        let tolerance_m = config.tolerance_m;
+        let beams = above_road(beams, attitude, config.low_height_m);
+        let ranges = |pose: &Pose3| ranges_along(&*self.map.renderer, pose, &beams, tolerance_m);
+        let (there_m, here_m) = (ranges(registered)?, ranges(predicted)?);
+        let share = agreement(&beams, &there_m, tolerance_m);
+        let is_sure = share.is_some_and(|share| share >= config.sure_agreement);
+        Ok(is_sure && agrees_better(&beams, [&there_m, &here_m], tolerance_m))
     }
 
     /// Samples the particles from a posterior.
@@ -133,6 +191,7 @@ impl ParticleFilter {
             beams: posterior.beams,
             attitude: posterior.attitude,
             pose,
+            refutes: posterior.refutes,
         }
     }
 }
@@ -224,6 +283,55 @@ mod tests {
         // The given start is off, by 15 standard deviations.
         let off = world.ground.lift(&aside, &attitude).unwrap();
         assert!(error_m(truth, 0.1, off) < 0.01);
+    }
+
+    #[test]
+    fn a_registration_that_refutes_the_prediction_replaces_it_and_the_next_scan_confirms_it() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let attitude = SensorAttitude::default();
+        let scan = world.scan(&truth);
+        let covariance = nalgebra::Matrix3::identity() * 1e-4;
+        let prior = Gaussian::new(truth * Pose2::translation(0.0, 0.4), covariance).unwrap();
+        let mut rng = StdRng::seed_from_u64(1);
+        let mut filter = tracking(&world, &prior, &mut rng);
+        let states = [0; 3].map(|_| {
+            let estimate = filter.step(Odometry::Unknown, &scan, &attitude, &mut rng);
+            let estimate = estimate.unwrap();
+            assert!(deviation(&estimate.pose, &truth).xy().norm() < 0.01);
+            estimate.state
+        });
+        use crate::localization::State::{Searching, Tracking};
+        assert_eq!(states, [Searching, Tracking, Tracking]);
+    }
+
+    #[test]
+    fn a_prediction_is_refuted_by_half_of_the_beams_that_disagree_there() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let attitude = SensorAttitude::default();
+        let prior = Gaussian::new(truth, nalgebra::Matrix3::identity() * 1e-4).unwrap();
+        let mut rng = StdRng::seed_from_u64(1);
+        let filter = tracking(&world, &prior, &mut rng);
+        let beams: Vec<Beam> = world.scan(&truth).beams().collect();
+        let aside = |aside_m: f64| {
+            let pose = truth * Pose2::translation(0.0, aside_m);
+            world.ground.lift(&pose, &attitude).unwrap().unwrap()
+        };
+        let refutes = |predicted_m: f64, registered_m: f64, beams: &[Beam]| {
+            let (predicted, registered) = (aside(predicted_m), aside(registered_m));
+            let found = filter.is_refuted(&predicted, &registered, (beams, &attitude));
+            found.unwrap()
+        };
+        assert!(refutes(0.6, 0.0, &beams) && !refutes(0.0, 0.6, &beams));
+        // Where all beams agree, nothing is refuted.
+        assert!(!refutes(0.0, 0.01, &beams));
+        // A third of the beams is too short: they agree nowhere.
+        let shortened = (beams.iter().enumerate()).map(|(number, beam)| Beam {
+            range_m: beam.range_m * if number % 3 == 0 { 0.9 } else { 1.0 },
+            ..*beam
+        });
+        assert!(!refutes(0.6, 0.0, &shortened.collect::<Vec<_>>()));
     }
 
     #[test]

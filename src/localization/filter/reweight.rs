@@ -22,6 +22,8 @@ pub(super) struct Update {
     pub(super) attitude: SensorAttitude,
     /// Pose of the posterior, or of the likeliest of several places; `None` for the weighted mean.
     pub(super) pose: Option<Pose2>,
+    /// Whether the scan shows that the prediction is wrong.
+    pub(super) refutes: bool,
 }
 
 impl ParticleFilter {
@@ -69,6 +71,7 @@ impl ParticleFilter {
                     beams,
                     attitude: self.refined_attitude(scan, attitude)?,
                     pose: None,
+                    refutes: false,
                 });
             }
             self.resample(rng);
@@ -115,8 +118,10 @@ impl ParticleFilter {
         estimate.updated = true;
         estimate.mean_cost_m = update.mean_cost_m;
         let is_narrow = self.is_narrow();
-        // A jump of a wide distribution is not a motion of the car.
-        if self.updated.is_narrow && is_narrow {
+        // A jump of a wide distribution is not a motion of the car, nor is one to where the prediction should have been. Where that
+        // repeats itself, the car moved otherwise.
+        let is_motion = !update.refutes || self.updated.refuted;
+        if self.updated.is_narrow && is_narrow && is_motion {
             self.last_motion = Some(LastMotion {
                 increment: self.updated.pose.inverse() * pose,
                 duration_s: self.duration_s,
@@ -126,6 +131,7 @@ impl ParticleFilter {
             pose,
             covariance,
             is_narrow,
+            refuted: update.refutes,
         };
         Ok(estimate)
     }

@@ -95,6 +95,7 @@ impl ParticleFilter {
             beams,
             attitude,
             pose: Some(*places[best].pose()),
+            refutes: false,
         }))
     }
 

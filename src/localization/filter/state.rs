@@ -48,6 +48,8 @@ pub(super) struct Updated {
     pub covariance: Matrix3<f64>,
     /// Whether the distribution around it was narrow.
     pub is_narrow: bool,
+    /// Whether its scan refuted the prediction: the next one has to confirm it.
+    pub refuted: bool,
 }
 
 /// Motion since the last update.
@@ -74,6 +76,7 @@ impl Updated {
             pose,
             covariance: particles.covariance_about(&pose),
             is_narrow: false,
+            refuted: false,
         }
     }
 }

@@ -4,6 +4,7 @@ use nalgebra::Matrix3;
 use rand::Rng;
 
 use super::phase::{Evidence, Phase};
+use super::reweight::Update;
 use super::state::{ParticleFilter, Pending};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, PERIOD_S, RangeImage};
@@ -35,15 +36,23 @@ impl ParticleFilter {
             return Ok(coasted);
         }
         self.propagate(odometry, rng);
-        let update = match self.propose(scan, attitude, start, rng)? {
+        let mut update = match self.propose(scan, attitude, start, rng)? {
             Some(posterior) => self.sample(posterior, rng),
             None => self.reweight_widely(scan, attitude, rng)?,
         };
-        let mut estimate = self.updated_estimate(&update)?;
-        estimate.agreement =
-            self.agreement_at(&estimate.map_from_lidar, &update.beams, &update.attitude)?;
+        let mut estimate = self.compared_estimate(&update)?;
+        let mut evidence = self.evidence(&estimate, odometry);
+        let is_found = evidence.is_confirmed && !self.phase.is_tracking();
+        if is_found
+            && let Some(better) = self.better_next_to_particles(scan, &update.attitude, rng)?
+        {
+            update = self.sample(better, rng);
+            estimate = self.compared_estimate(&update)?;
+        }
+        if update.refutes {
+            evidence = evidence.refuted();
+        }
         self.attitude = Some(update.attitude);
-        let evidence = self.evidence(&estimate, odometry);
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
         let is_far_below_usual =
@@ -51,6 +60,14 @@ impl ParticleFilter {
         let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_far_below_usual;
         estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
+        Ok(estimate)
+    }
+
+    /// The estimate after an update, with its agreement with the map.
+    fn compared_estimate(&mut self, update: &Update) -> Result<Estimate, RenderError> {
+        let mut estimate = self.updated_estimate(update)?;
+        estimate.agreement =
+            self.agreement_at(&estimate.map_from_lidar, &update.beams, &update.attitude)?;
         Ok(estimate)
     }
 
@@ -78,14 +95,15 @@ impl ParticleFilter {
         })
     }
 
-    /// Without odometry every scan is used: nothing else shows whether the car moves.
+    /// Without odometry every scan is used: nothing else shows whether the car moves. So is one after a refuted prediction.
     fn is_update_due(&self, odometry: Odometry) -> bool {
         let is_due = |pending: &Pending| {
             pending.motion.translation.vector.norm() > self.config.move_thres_m
                 || pending.motion.rotation.angle().abs() > self.config.turn_thres_rad
                 || self.is_less_certain(pending, odometry)
         };
-        odometry == Odometry::Unknown || self.pending.as_ref().is_none_or(is_due)
+        let needs_scan = odometry == Odometry::Unknown || self.updated.refuted;
+        needs_scan || self.pending.as_ref().is_none_or(is_due)
     }
 
     /// Whether a pose that is tracked and registered is less certain, by the motion since the last update, than that left it.
