@@ -785,6 +785,38 @@ mod tests {
     }
 
     #[test]
+    fn tiles_ahead_of_a_drive_are_in_memory_before_they_are_needed() {
+        let (_folder, file) = saved();
+        drop(Map::load(&file, &options()).unwrap());
+        let files = open(&file).unwrap().files.clone();
+        let in_memory = |origin: DVec3| {
+            let store = open(&file).unwrap();
+            drop(store.scene(&[origin]));
+            for _ in 0..60_000 {
+                if !store.is_reading_ahead.load(Ordering::Acquire) {
+                    break;
+                }
+                thread::sleep(Duration::from_millis(1));
+            }
+            let is_there = |number: &usize| store.resident().slots[*number].get().is_some();
+            let numbers = 0..store.files.tiles.len();
+            numbers.filter(is_there).collect::<Vec<usize>>()
+        };
+        let number = |x_m: f64| files.numbers[&TileIndex::of(x_m, 0.0, files.side_m)];
+        let sorted = |mut numbers: Vec<usize>| {
+            numbers.sort_unstable();
+            numbers.dedup();
+            numbers
+        };
+        // Tiles of 100 m, whose ends are 50 m from their middles.
+        for (x, expected_m) in [(600.0, vec![600.0]), (640.0, vec![600.0, 700.0])] {
+            let near = [-AHEAD_M, AHEAD_M].map(|ahead_m| number(x + ahead_m));
+            let expected = sorted(expected_m.into_iter().map(number).chain(near).collect());
+            assert_eq!(in_memory(DVec3::new(x, 0.0, 2.0)), expected, "{x}");
+        }
+    }
+
+    #[test]
     #[cfg(feature = "gpu")]
     fn a_map_on_disk_is_seen_as_in_memory_on_a_graphics_adapter_too() {
         let options = MapOptions {
