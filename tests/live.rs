@@ -118,6 +118,29 @@ fn a_damaged_scan_is_counted_and_the_others_are_localized() {
 }
 
 #[test]
+fn scans_of_another_sensor_are_reported_and_those_that_fit_are_localized() {
+    let recording = street(12);
+    for frame in 0..4 {
+        // Points half way to the zenith, where the sensor of the configuration sees nothing.
+        let points = recording.scan(frame);
+        let raised = points.iter().map(|[x, y, _]| [*x, *y, x.hypot(*y)]);
+        recording.write_scan(frame, &raised.collect::<Vec<_>>());
+    }
+    let call = patient(&recording).set("pose_tracking", "False");
+    let output = call.with("--start=2,0,0").with("--json").succeeds();
+    let report = report(&output);
+    assert_eq!(report["live"]["rejected"], 4, "{report}");
+    let states = &report["live"]["states"];
+    assert!(
+        states["tracking"].as_u64() >= Some(7) && states["lost"].is_null(),
+        "{report}"
+    );
+    let expected = "outside the field of view of the sensor";
+    let stderr = &output.stderr;
+    assert_eq!(stderr.matches(expected).count(), 1, "{stderr}");
+}
+
+#[test]
 fn a_run_begins_where_the_last_one_ended_if_the_scans_confirm_it() {
     let recording = street(12);
     let first = patient(&recording).with("--start=last").succeeds();

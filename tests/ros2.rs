@@ -7,11 +7,14 @@
 
 mod common;
 
+use std::fs;
 use std::path::Path;
 use std::process::Command;
 
 use common::Recording;
+use fpmcl::geometry::StampedPose;
 use fpmcl::internals::app::LocalizationResults;
+use fpmcl::recording::{PoseTrack, write_tum};
 use serde_json::{Value, json};
 
 const RESULT: &str = "results/localization.npz";
@@ -49,8 +52,27 @@ fn in_namespace() -> Command {
     command
 }
 
-/// Runs a scenario of the robot; `None`, with a message, where what it needs is missing.
+/// Runs a scenario of the robot on a street, with its configuration; `None`, with a message, where what it needs is missing.
 fn robot(recording: &Recording, scenario: &str, arguments: &[&str]) -> Option<Value> {
+    let common = [
+        "localization.yml",
+        "--start=0,0,0",
+        "--queue=1000",
+        "--set=pose_file=null",
+        "--set=pose_tracking=null",
+        "--set=odometry=auto",
+        "--output=live/localization.npz",
+    ];
+    play(
+        recording.folder(),
+        "velodyne",
+        scenario,
+        &[&common, arguments].concat(),
+    )
+}
+
+/// Runs a scenario of the robot with the scans of a folder, and the program with arguments.
+fn play(folder: &Path, scans: &str, scenario: &str, arguments: &[&str]) -> Option<Value> {
     let Some(python) = common::python_with("cyclonedds", "ros2") else {
         skipped("FPMCL_PYTHON names no interpreter with cyclonedds");
         return None;
@@ -62,20 +84,10 @@ fn robot(recording: &Recording, scenario: &str, arguments: &[&str]) -> Option<Va
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/ros2/robot.py");
     let mut command = in_namespace();
-    command
-        .arg(python)
-        .arg(script)
-        .args(["play", "velodyne", scenario, "--"]);
+    command.arg(python).arg(script);
+    command.args(["play", scans, scenario, "--"]);
     command.arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
-    command.args(["live", "localization.yml", "--backend=cpu", "--json"]);
-    command.args(["--ros2=/points", "--start=0,0,0", "--queue=1000"]);
-    command.args(["--set", "pose_file=null", "--set", "pose_tracking=null"]);
-    command.args([
-        "--set",
-        "odometry=auto",
-        "--output",
-        "live/localization.npz",
-    ]);
+    command.args(["live", "--ros2=/points", "--backend=cpu", "--json"]);
     for variable in [
         "ROS_DOMAIN_ID",
         "ROS_AUTOMATIC_DISCOVERY_RANGE",
@@ -86,7 +98,7 @@ fn robot(recording: &Recording, scenario: &str, arguments: &[&str]) -> Option<Va
     }
     let output = command
         .args(arguments)
-        .current_dir(recording.folder())
+        .current_dir(folder)
         .output()
         .unwrap();
     let stderr = String::from_utf8_lossy(&output.stderr);
@@ -204,6 +216,86 @@ fn a_robot_receives_the_poses_that_localize_finds_on_the_same_scans() {
     };
     assert_eq!(rows("live"), rows("results"));
     assert!(recording.path("live/report.html").exists());
+}
+
+#[test]
+fn a_drive_of_ten_seconds_with_its_odometry_is_localized_on_the_way_as_afterwards() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    for drive in ["drive=1", "drive=2"] {
+        let call = common::fpmcl("simulate").in_folder(folder);
+        let call = call
+            .set("output_folder", ".")
+            .with(format!("--set={drive}"));
+        let call = call
+            .set("n_scans", "100")
+            .set("scanner.azimuth_steps", "600");
+        call.set("path", "[{length_m: 110, turn_deg: 30}]")
+            .succeeds();
+    }
+    let file = |name: &str| folder.join(name);
+    let odometry = PoseTrack::read(
+        &file("drive_2/odometry.txt"),
+        Some(&file("drive_2/calib.txt")),
+    );
+    let rows = odometry.unwrap().map_from_lidar.into_iter().enumerate();
+    let rows = rows.map(|(frame, map_from_lidar)| StampedPose {
+        frame,
+        time_s: 0.1 * frame as f64,
+        map_from_lidar,
+    });
+    let driven = fs::File::create(file("driven.txt")).unwrap();
+    write_tum(driven, &rows.collect::<Vec<_>>()).unwrap();
+    let call = common::fpmcl("build-map").in_folder(folder);
+    call.with("drive_1").with("--output=map.ply").succeeds();
+    let call = common::fpmcl("localize").in_folder(folder).with("drive_2");
+    let call = call
+        .with("--map=map.ply")
+        .with("--odometry=driven.txt")
+        .with("--backend=cpu");
+    call.with("--output=afterwards/localization.npz").succeeds();
+
+    let read = |name: &str| LocalizationResults::read(&file(name)).unwrap();
+    let afterwards = read("afterwards/localization.npz");
+    let start = &afterwards.estimates.unwrap()[0];
+    let [x, y, turn] = [
+        start.translation.x,
+        start.translation.y,
+        start.rotation.angle(),
+    ];
+    let start = format!("--start={x},{y},{}", turn.to_degrees());
+    let afterwards = afterwards.estimates_in_space.unwrap();
+
+    let arguments = [
+        "--map=map.ply",
+        "--odometry=/odom",
+        "--output=live/localization.npz",
+        &start,
+    ];
+    let Some(outcome) = play(folder, "drive_2/velodyne", "driven", &arguments) else {
+        return;
+    };
+    let counts = ["received", "dropped"].map(|key| outcome["report"]["live"][key].as_u64());
+    let [received, dropped] = counts.map(Option::unwrap);
+    assert_eq!(received, 100);
+    let live = read("live/localization.npz");
+    assert_eq!(live.frames.len() as u64, 100 - dropped);
+    // Scans that are dropped change the random beams of those after them: millimetres.
+    let poses = positions(&outcome["received"]["/fpmcl/pose"]).into_iter();
+    let apart_m = poses
+        .map(|(frame, position)| distance_m(position, afterwards[frame].translation.vector.into()));
+    let mut apart_m: Vec<f64> = apart_m.collect();
+    apart_m.sort_by(f64::total_cmp);
+    assert!(
+        apart_m.len() >= 20,
+        "{} of {dropped} dropped",
+        apart_m.len()
+    );
+    let (median_m, largest_m) = (apart_m[apart_m.len() / 2], apart_m[apart_m.len() - 1]);
+    assert!(
+        median_m < 0.003 && largest_m < 0.01,
+        "{median_m} {largest_m}"
+    );
 }
 
 #[test]

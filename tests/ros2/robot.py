@@ -353,8 +353,8 @@ class Wheeled(Robot):
     def pose_in_odom(self, frame):
         return self.pose(2.0 + 0.51 * frame, 0.005 * frame)
 
-    def place(self):
-        mounting = TransformStamped(Header(stamp(0), "base_link"), "lidar", self.pose(1.0))
+    def place(self, ahead_m=1.0):
+        mounting = TransformStamped(Header(stamp(0), "base_link"), "lidar", self.pose(ahead_m))
         self.static.write(TFMessage([mounting]))
         self.receiver.wait("the reader of transforms", self.transforms.get_matched_subscriptions)
 
@@ -433,10 +433,15 @@ def kidnapped(folder, receiver, _program):
     return [3]
 
 
-def misled(folder, receiver, _program):
-    """A pose across the street is proposed while it is tracked."""
+def misled(folder, receiver, program):
+    """Poses outside the map and across the street are proposed while it is tracked."""
     robot = Robot(folder, receiver)
-    robot.drive(range(5))
+    robot.drive(range(4))
+    robot.propose(5000.0, 0.0, robot.moment(3))
+    receiver.wait("the refusal of a proposal", lambda: "x 5000.0 m, y 0.0 m is outside the mapped area" in program.log_text())
+    if receiver.has_state("a pose was proposed"):
+        sys.exit("a pose outside the map is taken")
+    robot.drive([4])
     seen = receiver.wait_for_state("tracking: ")
     robot.propose(2.0, 4.0, robot.moment(4))
     receiver.wait_for_state("searching: a pose was proposed", seen)
@@ -514,6 +519,29 @@ def wheels(folder, receiver, _program):
     robot.drive(range(12))
 
 
+class Driven(Wheeled):
+    """Its odometry is in a file, and known up to the frame after a scan; the lidar is at the base."""
+
+    def __init__(self, folder, receiver):
+        super().__init__(folder, receiver)
+        rows = [[float(word) for word in row.split()] for row in open("driven.txt")]
+        self.poses = [Pose(Vector3(*row[1:4]), Quaternion(*row[4:])) for row in rows]
+
+    def pose_in_odom(self, frame):
+        return self.poses[min(frame, len(self.poses) - 1)]
+
+    def before(self, frame):
+        for of in [frame, frame + 1] if frame == 0 else [frame + 1]:
+            self.turn_wheels(of)
+
+
+def driven(folder, receiver, _program):
+    """A drive of many scans, with the odometry of a file."""
+    robot = Driven(folder, receiver)
+    robot.place(ahead_m=0.0)
+    robot.drive(range(len(robot.scans)))
+
+
 class Program:
     """The program that is tried."""
 
@@ -566,6 +594,6 @@ if __name__ == "__main__":
     if sys.argv[1] == "receive":
         receive()
     folder, scenario = sys.argv[2:4]
-    known = [drive, events, kidnapped, misled, frozen, mistyped, carried, reliable, restarted, wheels]
+    known = [drive, events, kidnapped, misled, frozen, mistyped, carried, reliable, restarted, wheels, driven]
     scenarios = {it.__name__: it for it in known}
     play(folder, scenarios[scenario], sys.argv[5:])
