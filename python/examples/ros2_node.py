@@ -1,8 +1,7 @@
 """A node of ROS 2 that localizes clouds in a map: python ros2_node.py MAP.ply [--ros-args -r points:=/velodyne_points].
 
-It needs rclpy of ROS 2 with tf2_ros, its messages, and SciPy. `fpmcl live --ros2` does the same and more without ROS; this is a
-start for a node of one's own: subscribe, step, publish. It publishes the transform from `map` to the parameter `base_frame`. Where
-somebody publishes the robot in `odom`, publish from `map` to `odom` instead: map_from_base @ inv(odom_from_base).
+A start for a node of one's own, with SciPy; `fpmcl live --ros2` does the same and more without ROS. Where somebody publishes the
+robot in `odom`, publish the transform from `map` to `odom` instead: map_from_base @ inv(odom_from_base).
 """
 
 import sys
@@ -42,20 +41,18 @@ class Localization(Node):
             self.get_logger().warning(f"a cloud has no pose: {error}", throttle_duration_sec=1.0)
             return
         if estimate.state != "tracking":
-            self.get_logger().info(f"{estimate.state}: {estimate.places} places", throttle_duration_sec=1.0)
             return
+        map_from_base = estimate.map_from_lidar @ np.linalg.inv(matrix(mounting))
         transform = TransformStamped(child_frame_id=self.base_frame)
         transform.header.stamp, transform.header.frame_id = stamp, "map"
-        map_from_base = estimate.map_from_lidar @ np.linalg.inv(matrix(mounting))
         t, q = transform.transform.translation, transform.transform.rotation
         t.x, t.y, t.z = map_from_base[:3, 3].tolist()
         q.x, q.y, q.z, q.w = Rotation.from_matrix(map_from_base[:3, :3]).as_quat().tolist()
         self.transforms.sendTransform(transform)
-
         message = PoseWithCovarianceStamped(header=transform.header)
         position, message.pose.pose.orientation = message.pose.pose.position, q
         position.x, position.y, position.z = t.x, t.y, t.z
-        # Rows and columns of x, y and heading, those of the lidar; -1 is not known.
+        # Covariance of x, y and heading of the lidar; -1 is not known.
         covariance = -np.eye(6)
         covariance[np.ix_([0, 1, 5], [0, 1, 5])] = estimate.covariance
         message.pose.covariance = covariance.ravel().tolist()
@@ -65,9 +62,8 @@ class Localization(Node):
 def matrix(transform):
     """A transform as a matrix, (4, 4)."""
     t, q = transform.translation, transform.rotation
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z]
-    return pose
+    rotation = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    return np.vstack([np.column_stack([rotation, [t.x, t.y, t.z]]), [0, 0, 0, 1]])
 
 
 if __name__ == "__main__":
