@@ -420,7 +420,7 @@ def thresholds(work, _seeds):
         """Frames that are tracking, frames of them that are wrong, position error and squared error."""
         with open(folder / "frames.csv", newline="") as file:
             frames = [it for it in csv.DictReader(file) if it["state"] == "tracking"]
-        wrong = sum(float(it["mcl_position_error_m"]) > 0.5 for it in frames)
+        wrong = sum(float(it[f"{run_of}_position_error_m"]) > 0.5 for it in frames)
         found = json.loads((folder / "report.json").read_text())[run_of]
         error = "-"
         if found and found["consistency"]:
