@@ -7,9 +7,9 @@ mod common;
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use common::{COMPARISON_OF_STREET, Fpmcl, Recording, fpmcl, json};
+use common::{COMPARISON_OF_STREET, Fpmcl, Recording, column, fpmcl, json, numbers};
 
 const FRAMES: usize = 12;
 
@@ -109,23 +109,10 @@ fn every_run_is_executed_once_and_an_interrupted_comparison_resumes() {
     other.with("--collect").fails_with(&["no run is finished"]);
 }
 
-/// The numbers of a column of a table.
-fn numbers(table: &Path, column: &str) -> Vec<f64> {
-    let text = fs::read_to_string(table).unwrap();
-    let mut rows = text.lines().map(|row| row.split(','));
-    let place = rows
-        .next()
-        .unwrap()
-        .position(|name| name == column)
-        .unwrap();
-    rows.map(|mut row| row.nth(place).unwrap().parse().unwrap())
-        .collect()
-}
-
 fn the_tables_agree_with_the_runs(recording: &Recording) {
     let comparison = json(&recording.path("out/comparison.json"));
     let table = &comparison["tables"][0];
-    let column = |name: &str| {
+    let place_of = |name: &str| {
         let columns = table["columns"].as_array().unwrap();
         columns
             .iter()
@@ -133,10 +120,10 @@ fn the_tables_agree_with_the_runs(recording: &Recording) {
             .unwrap()
     };
     let (error, claim) = (
-        column("average positional error"),
-        column("claimed by the report"),
+        place_of("average positional error"),
+        place_of("claimed by the report"),
     );
-    let name = column("configuration");
+    let name = place_of("configuration");
     for (row, claimed_m) in table["rows"]
         .as_array()
         .unwrap()
@@ -149,19 +136,35 @@ fn the_tables_agree_with_the_runs(recording: &Recording) {
             let record = json(&recording.path(&format!("{folder}/run.json")));
             let pointer = "/outcome/finished/metrics/position_m/mean";
             let error_m = record.pointer(pointer).unwrap().as_f64().unwrap();
-            let trajectory = if configuration.contains("PSO") {
-                "refined"
+            let report = json(&recording.path(&format!("{folder}/report.json")));
+            let (trajectory, state) = if configuration.contains("PSO") {
+                ("refined", "refined_state")
             } else {
-                "mcl"
+                ("mcl", "state")
             };
-            // Of all frames but the first half, whatever their states.
-            let errors_m = numbers(
-                &recording.path(&format!("{folder}/frames.csv")),
-                &format!("{trajectory}_position_error_m"),
+            let pointer = format!("/{trajectory}/metrics/position_m/mean");
+            let reported_m = report.pointer(&pointer).unwrap().as_f64().unwrap();
+            // The first half is not evaluated. A comparison evaluates all other frames, a report those that are tracking.
+            let table = recording.path(&format!("{folder}/frames.csv"));
+            let errors_m = numbers(&table, &format!("{trajectory}_position_error_m"));
+            let is_tracking = column(&table, state).into_iter().map(|it| it == "tracking");
+            let evaluated: Vec<(f64, bool)> = errors_m
+                .into_iter()
+                .zip(is_tracking)
+                .skip(FRAMES / 2)
+                .collect();
+            let mean_m = |frames: Vec<f64>| frames.iter().sum::<f64>() / frames.len() as f64;
+            let of_all_m = mean_m(evaluated.iter().map(|frame| frame.0).collect());
+            let tracked = evaluated.iter().filter(|frame| frame.1);
+            let of_tracked_m = mean_m(tracked.map(|frame| frame.0).collect());
+            assert!((of_all_m - error_m).abs() < 1e-4, "{of_all_m} {error_m}");
+            assert!(
+                (of_tracked_m - reported_m).abs() < 1e-4,
+                "{of_tracked_m} {reported_m}"
             );
-            let evaluated = &errors_m[FRAMES / 2..];
-            let mean_m = evaluated.iter().sum::<f64>() / evaluated.len() as f64;
-            assert!((mean_m - error_m).abs() < 1e-4, "{mean_m} {error_m}");
+            if evaluated.iter().all(|frame| frame.1) {
+                assert_eq!(reported_m, error_m);
+            }
             error_m
         });
         let mean = row[error]["estimate"]["mean"].as_f64().unwrap();

@@ -701,15 +701,8 @@ fn the_program_rasterizes_or_casts_whole_images_with_the_same_result() {
         let printed = localize("gpu", method).exits_with(3).stderr;
         let measured = "ms by casting rays and";
         assert_eq!(printed.contains(measured), method == "auto", "{printed}");
-        let table = recording.bytes(&format!("gpu_{method}/frames.csv"));
-        let table = String::from_utf8(table).unwrap();
-        let mut rows = table.lines().map(|row| row.split(',').collect::<Vec<_>>());
-        let names = rows.next().unwrap();
-        let column = names
-            .iter()
-            .position(|name| *name == "mcl_position_error_m");
-        let error_m = |row: Vec<&str>| row[column.unwrap()].parse::<f64>().unwrap();
-        rows.map(error_m).collect::<Vec<_>>()
+        let table = recording.path(&format!("gpu_{method}/frames.csv"));
+        common::numbers(&table, "mcl_position_error_m")
     });
     assert!(
         errors_m[0].len() == 6 && errors_m[0].iter().all(|m| *m < 5.0),

@@ -9,7 +9,9 @@ use std::fs;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, run, simulate_two_drives};
+use common::{
+    DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, numbers, run, simulate_two_drives,
+};
 use fpmcl::internals::app::LocalizationResults;
 use fpmcl::internals::ply;
 use fpmcl::localization::State;
@@ -68,15 +70,8 @@ fn localize(trial: &str, settings: &[&str]) -> Outcome {
             _ => call.with(setting),
         });
     call.succeeds();
-    let table = fs::read_to_string(folder.join(trial).join("frames.csv")).unwrap();
-    let column = table.lines().next().unwrap();
-    let column = column
-        .split(',')
-        .position(|name| name == "mcl_position_error_m")
-        .unwrap();
-    let errors_m: Vec<f64> = (table.lines().skip(1))
-        .map(|row| row.split(',').nth(column).unwrap().parse().unwrap())
-        .collect();
+    let table = folder.join(trial).join("frames.csv");
+    let errors_m = numbers(&table, "mcl_position_error_m");
     assert_eq!(errors_m.len(), FRAMES);
     Outcome {
         worst_m: errors_m[20..].iter().copied().fold(0.0, f64::max),

@@ -222,17 +222,13 @@ fn a_robot_receives_the_poses_that_localize_finds_on_the_same_scans() {
 fn a_drive_of_ten_seconds_with_its_odometry_is_localized_on_the_way_as_afterwards() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    for drive in ["drive=1", "drive=2"] {
-        let call = common::fpmcl("simulate").in_folder(folder);
-        let call = call
-            .set("output_folder", ".")
-            .with(format!("--set={drive}"));
-        let call = call
-            .set("n_scans", "100")
-            .set("scanner.azimuth_steps", "600");
-        call.set("path", "[{length_m: 110, turn_deg: 30}]")
-            .succeeds();
-    }
+    let simulation = "\
+output_folder: .
+n_scans: 100
+scanner: {azimuth_steps: 600}
+path: [{length_m: 110, turn_deg: 30}]
+";
+    common::simulate_two_drives(folder, simulation);
     let file = |name: &str| folder.join(name);
     let odometry = PoseTrack::read(
         &file("drive_2/odometry.txt"),

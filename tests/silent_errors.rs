@@ -159,18 +159,8 @@ fn frames_that_are_lost_are_no_part_of_the_trajectory_its_length_and_its_picture
     ] {
         plain(command).exits_with(0);
         let table = String::from_utf8(recording.bytes("results/frames.csv")).unwrap();
-        let column = table
-            .lines()
-            .next()
-            .unwrap()
-            .split(',')
-            .position(|it| it == column);
-        let states = table
-            .lines()
-            .skip(1)
-            .map(|row| row.split(',').nth(column.unwrap()).unwrap());
-        let states: Vec<&str> = states.collect();
-        let tracked = states.iter().filter(|state| **state == "tracking").count();
+        let states = common::column(&recording.path("results/frames.csv"), column);
+        let tracked = states.iter().filter(|state| *state == "tracking").count();
         assert!((6..12).contains(&tracked), "{states:?}");
         // What is not known has an empty cell.
         assert!(!table.contains(",-1.0000"), "{table}");
@@ -178,7 +168,7 @@ fn frames_that_are_lost_are_no_part_of_the_trajectory_its_length_and_its_picture
         for (row, state) in table.lines().skip(1).zip(&states) {
             let cells = titles.iter().zip(row.split(','));
             let mut cells = cells.filter(|(title, _)| title.starts_with("trajectory_"));
-            let is_empty = command == "localize" && *state != "tracking";
+            let is_empty = command == "localize" && state != "tracking";
             assert!(!is_empty || cells.all(|(_, cell)| cell.is_empty()), "{row}");
         }
         let kitti = format!("results/{name}_kitti.txt");

@@ -1,7 +1,7 @@
 """A node of ROS 2 that localizes clouds in a map: python ros2_node.py MAP.ply [--ros-args -r points:=/velodyne_points].
 
-A start for a node of one's own, with SciPy; `fpmcl live --ros2` does the same and more without ROS. Where somebody publishes the
-robot in `odom`, publish the transform from `map` to `odom` instead: map_from_base @ inv(odom_from_base).
+A start for a node of one's own, with rclpy, tf2_ros and SciPy; `fpmcl live --ros2` does the same and more without ROS. The robot is the
+parameter `base_frame`. Where somebody publishes it in `odom`, publish `odom` in `map` instead: map_from_base @ inv(odom_from_base).
 """
 
 import sys
@@ -41,6 +41,7 @@ class Localization(Node):
             self.get_logger().warning(f"a cloud has no pose: {error}", throttle_duration_sec=1.0)
             return
         if estimate.state != "tracking":
+            self.get_logger().info(f"{estimate.state}: {estimate.places} places", throttle_duration_sec=1.0)
             return
         map_from_base = estimate.map_from_lidar @ np.linalg.inv(matrix(mounting))
         transform = TransformStamped(child_frame_id=self.base_frame)
@@ -52,8 +53,7 @@ class Localization(Node):
         message = PoseWithCovarianceStamped(header=transform.header)
         position, message.pose.pose.orientation = message.pose.pose.position, q
         position.x, position.y, position.z = t.x, t.y, t.z
-        # Covariance of x, y and heading of the lidar; -1 is not known.
-        covariance = -np.eye(6)
+        covariance = -np.eye(6)  # Of the lidar: x, y, heading; -1 is not known.
         covariance[np.ix_([0, 1, 5], [0, 1, 5])] = estimate.covariance
         message.pose.covariance = covariance.ravel().tolist()
         self.poses.publish(message)

@@ -229,6 +229,23 @@ pub fn json(path: &Path) -> serde_json::Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
+/// The cells of a column of a table such as `frames.csv`.
+#[track_caller]
+pub fn column(table: &Path, name: &str) -> Vec<String> {
+    let text = fs::read_to_string(table).unwrap();
+    let mut rows = text.lines().map(|row| row.split(','));
+    let place = rows.next().unwrap().position(|title| title == name);
+    rows.map(|mut row| row.nth(place.unwrap()).unwrap().to_owned())
+        .collect()
+}
+
+/// The numbers of a column of a table.
+#[track_caller]
+pub fn numbers(table: &Path, name: &str) -> Vec<f64> {
+    let cells = column(table, name).into_iter();
+    cells.map(|cell| cell.parse().unwrap()).collect()
+}
+
 /// Number of messages of each topic of a log, up to where it ends.
 pub fn messages_in(log: &Path) -> BTreeMap<String, usize> {
     let mut counts = BTreeMap::new();

@@ -520,25 +520,25 @@ def wheels(folder, receiver, _program):
 
 
 class Driven(Wheeled):
-    """Its odometry is in a file, and known up to the frame after a scan; the lidar is at the base."""
+    """Its odometry is in a file, and is known until the frame after a scan; the lidar is at the base."""
 
     def __init__(self, folder, receiver):
         super().__init__(folder, receiver)
-        rows = [[float(word) for word in row.split()] for row in open("driven.txt")]
+        rows = [[float(word) for word in row.split()] for row in pathlib.Path("driven.txt").read_text().splitlines()]
         self.poses = [Pose(Vector3(*row[1:4]), Quaternion(*row[4:])) for row in rows]
 
     def pose_in_odom(self, frame):
         return self.poses[min(frame, len(self.poses) - 1)]
 
     def before(self, frame):
-        for of in [frame, frame + 1] if frame == 0 else [frame + 1]:
-            self.turn_wheels(of)
+        self.turn_wheels(frame + 1)
 
 
 def driven(folder, receiver, _program):
     """A drive of many scans, with the odometry of a file."""
     robot = Driven(folder, receiver)
     robot.place(ahead_m=0.0)
+    robot.turn_wheels(0)
     robot.drive(range(len(robot.scans)))
 
 
