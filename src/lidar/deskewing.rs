@@ -19,6 +19,7 @@
 
 use std::f32::consts::TAU;
 use std::f64::consts::PI;
+use std::ops::Range;
 
 use glam::Vec3;
 use nalgebra::{UnitQuaternion, Vector3};
@@ -129,6 +130,12 @@ impl Motion {
             row => between(row.saturating_sub(1), (row + 1).min(last)),
         };
         (motion.duration_s > 0.0).then_some(motion)
+    }
+
+    /// The rows of a trajectory by which [`along`](Self::along) finds the motion around one of them: three, if there are as many.
+    pub(crate) fn rows_along(rows: usize, row: usize) -> Range<usize> {
+        let first = row.saturating_sub(1).min(rows.saturating_sub(3));
+        first..rows.min(first + 3)
     }
 
     /// The motion at the outer end of this step, extrapolated at constant acceleration from this step and its neighbour.
@@ -314,6 +321,26 @@ mod tests {
             epsilon = 1e-12
         );
         assert_eq!(Motion::along(&poses[..1], &times_s, 0), None);
+    }
+
+    #[test]
+    fn no_other_rows_change_the_motion_around_a_row() {
+        let times_s = [0.0, 0.1, 0.25, 0.3, 0.4];
+        let poses = times_s.map(|t| Pose3::translation(2.0 * t + 3.0 * t * t, 0.0, 0.0));
+        for rows in 1..=times_s.len() {
+            for row in 0..rows {
+                let around = Motion::rows_along(rows, row);
+                assert!(around.contains(&row) && around.end <= rows);
+                let mut elsewhere = poses;
+                for (other, pose) in elsewhere.iter_mut().enumerate() {
+                    if !around.contains(&other) {
+                        *pose = Pose3::translation(99.0, 9.0, 0.0);
+                    }
+                }
+                let along = |poses: &[Pose3]| Motion::along(&poses[..rows], &times_s, row);
+                assert_eq!(along(&elsewhere), along(&poses), "{rows} {row}");
+            }
+        }
     }
 
     fn rotation(direction: RotationDirection) -> Rotation {

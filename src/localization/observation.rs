@@ -297,23 +297,24 @@ pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option
     (counted >= MIN_BEAMS).then(|| on as f64 / counted as f64)
 }
 
-/// Whether beams agree with the map much better at one pose than at another, by its ranges along them there and here. Of those that
-/// count at both poses, gains less losses are at least half of what disagrees here, and more than chance by six standard deviations
-/// (McNemar, *Note on the sampling error of the difference between correlated proportions or percentages*, 1947).
+/// Whether beams agree with the map much better at one pose than at another, by its ranges along them there and here [m]. Of the
+/// beams that count at both poses, those gained less those lost are at least half of those that disagree here, and exceed chance by
+/// six standard deviations (McNemar, *Note on the sampling error of the difference between correlated proportions or percentages*,
+/// 1947).
 pub fn agrees_better(beams: &[Beam], [there_m, here_m]: [&[f32]; 2], tolerance_m: f32) -> bool {
     const SIGMAS: f64 = 6.0;
-    let (mut gained, mut lost, mut disagreeing) = (0.0, 0.0, 0.0);
+    let (mut gained, mut lost, mut neither) = (0.0, 0.0, 0.0);
     for (beam, (&there_m, &here_m)) in beams.iter().zip(there_m.iter().zip(here_m)) {
         let at = |rendered_m: f32| agrees(beam, rendered_m, tolerance_m);
         match (at(there_m), at(here_m)) {
             (Some(true), Some(false)) => gained += 1.0,
             (Some(false), Some(true)) => lost += 1.0,
+            (Some(false), Some(false)) => neither += 1.0,
             _ => {}
         }
-        disagreeing += f64::from(u8::from(at(here_m) == Some(false) && at(there_m).is_some()));
     }
     let gain: f64 = gained - lost;
-    gain >= 0.5 * disagreeing && gain > SIGMAS * f64::sqrt(gained + lost)
+    gain >= 0.5 * (gained + neither) && gain > SIGMAS * f64::sqrt(gained + lost)
 }
 
 /// Returns the beams that end above the road, which distinguish one place from another.

@@ -125,10 +125,8 @@ impl InitialEstimate {
         let in_space = map_from_lidar.map_or_else(|| level.collect(), <[Pose3]>::to_vec);
         let driven = Self::driven(increments);
         let motion = |row: usize| {
-            // Those from which the motion is found, three also at the ends.
-            let middle = row.clamp(1, estimates.len().saturating_sub(2).max(1));
-            let around = middle - 1..=(middle + 1).min(estimates.len() - 1);
-            let is_known = states[around].iter().all(|it| *it == State::Tracking);
+            let around = &states[Motion::rows_along(estimates.len(), row)];
+            let is_known = around.iter().all(|it| *it == State::Tracking);
             let poses = if is_known {
                 Some(&in_space)
             } else {
@@ -725,11 +723,10 @@ impl FrameResult {
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
+    use nalgebra::UnitQuaternion;
 
     use super::super::refiner::Method;
     use super::*;
-    use nalgebra::UnitQuaternion;
-
     use crate::geometry::pose2_from_pose3;
     use crate::lidar::LidarModel;
     use crate::map::world_for_tests::TestWorld;
@@ -953,7 +950,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_begins_as_its_estimate_in_space_is_held_and_not_as_the_frame_before() {
+    fn a_frame_begins_at_the_height_and_attitude_of_its_estimate_not_of_the_frame_before() {
         let world = TestWorld::street();
         let held = |x: f64, attitude: SensorAttitude| {
             let lifted = world.ground.lift(&world.pose_at(x, 0.0, 0.0), &attitude);
@@ -993,7 +990,7 @@ mod tests {
     }
 
     #[test]
-    fn of_several_levels_a_sensor_is_above_the_one_below_it() {
+    fn the_ground_of_a_sensor_is_the_highest_level_below_it() {
         let mut mesh = TriangleMesh::default();
         for height_m in [0.0, 6.0] {
             let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
@@ -1021,7 +1018,7 @@ mod tests {
             let (attitude, level_m) = known(&estimate).unwrap();
             assert_relative_eq!(level_m, expected_m, epsilon = 1e-6);
             assert_relative_eq!(attitude.height_m, z - expected_m, epsilon = 1e-6);
-            // Where the filter is not sure, it does not know how the sensor is held either.
+            // Where the filter is not sure of its pose, its attitude is not used either.
             let state = State::Searching;
             assert!(known(&InitialEstimate { state, ..estimate }).is_none());
         }

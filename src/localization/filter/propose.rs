@@ -32,7 +32,7 @@ pub(super) struct Posterior {
     level_m: f64,
     attitude: SensorAttitude,
     /// Whether the registration refutes the prediction.
-    refutes: bool,
+    pub(super) refutes: bool,
 }
 
 impl ParticleFilter {
@@ -72,34 +72,8 @@ impl ParticleFilter {
     }
 
     /// Registers the scan with the map, from `start` if that is plausible, else from the prediction, and fuses the result with the
-    /// prediction; `None` while the distribution is wide, where registration fails, and where its result is implausible and
-    /// does not refute the prediction.
+    /// prediction; `None` where registration fails, and where its result is implausible and does not refute the prediction.
     pub(super) fn propose(
-        &self,
-        scan: &RangeImage,
-        attitude: &SensorAttitude,
-        start: Option<Pose3>,
-        rng: &mut impl Rng,
-    ) -> Result<Option<Posterior>, RenderError> {
-        if !self.phase.is_tracking() {
-            return Ok(None);
-        }
-        self.fused(scan, attitude, start, rng)
-    }
-
-    /// Distribution of a pose next to the one to which the particles have converged, where the scan refutes this one.
-    pub(super) fn better_next_to_particles(
-        &self,
-        scan: &RangeImage,
-        attitude: &SensorAttitude,
-        rng: &mut impl Rng,
-    ) -> Result<Option<Posterior>, RenderError> {
-        let posterior = self.fused(scan, attitude, None, rng)?;
-        Ok(posterior.filter(|posterior| posterior.refutes))
-    }
-
-    /// As [`propose`](Self::propose), whatever the phase.
-    fn fused(
         &self,
         scan: &RangeImage,
         attitude: &SensorAttitude,
@@ -121,9 +95,10 @@ impl ParticleFilter {
             return Ok(None);
         };
         let is_plausible = |pose: &Pose2| prior.squared_distance(pose) <= MAX_SIGMAS.powi(2);
+        let predicted = patch.lift(&mean, attitude);
         let start = start
             .filter(|start| is_plausible(&pose2_from_pose3(start)))
-            .unwrap_or_else(|| patch.lift(&mean, attitude));
+            .unwrap_or(predicted);
         let renderer = &*self.map.renderer;
         let registration = self.registration();
         let Some(found) = register_informative(renderer, &registered, &start, &registration)?
@@ -134,7 +109,6 @@ impl ParticleFilter {
         let Some(measured) = Gaussian::new(pose, regular(&found.planar_covariance())) else {
             return Ok(None);
         };
-        let predicted = patch.lift(&mean, attitude);
         let refutes = !is_plausible(&pose);
         if refutes && !self.is_refuted(&predicted, &found.map_from_lidar, (&beams, attitude))? {
             return Ok(None);
@@ -203,8 +177,8 @@ mod tests {
     use rand::{SeedableRng as _, rngs::StdRng};
 
     use super::*;
-    use crate::localization::LocalizerConfig;
     use crate::localization::particles::deviation;
+    use crate::localization::{LocalizerConfig, State};
     use crate::map::world_for_tests::TestWorld;
 
     /// A filter that tracks, with particles of a distribution.
@@ -301,12 +275,11 @@ mod tests {
             assert!(deviation(&estimate.pose, &truth).xy().norm() < 0.01);
             estimate.state
         });
-        use crate::localization::State::{Searching, Tracking};
-        assert_eq!(states, [Searching, Tracking, Tracking]);
+        assert_eq!(states, [State::Searching, State::Tracking, State::Tracking]);
     }
 
     #[test]
-    fn a_prediction_is_refuted_by_half_of_the_beams_that_disagree_there() {
+    fn a_prediction_is_refuted_where_many_more_beams_agree_at_the_registered_pose() {
         let world = TestWorld::street();
         let truth = world.pose_at(12.0, 0.2, 0.05);
         let attitude = SensorAttitude::default();

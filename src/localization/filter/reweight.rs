@@ -118,8 +118,8 @@ impl ParticleFilter {
         estimate.updated = true;
         estimate.mean_cost_m = update.mean_cost_m;
         let is_narrow = self.is_narrow();
-        // A jump of a wide distribution is not a motion of the car, nor is one to where the prediction should have been. Where that
-        // repeats itself, the car moved otherwise.
+        // A jump of a wide distribution is not a motion of the car, nor is the correction of a refuted prediction. One that follows
+        // another is: the car moved otherwise than predicted.
         let is_motion = !update.refutes || self.updated.refuted;
         if self.updated.is_narrow && is_narrow && is_motion {
             self.last_motion = Some(LastMotion {

@@ -36,7 +36,12 @@ impl ParticleFilter {
             return Ok(coasted);
         }
         self.propagate(odometry, rng);
-        let mut update = match self.propose(scan, attitude, start, rng)? {
+        let posterior = if self.phase.is_tracking() {
+            self.propose(scan, attitude, start, rng)?
+        } else {
+            None
+        };
+        let mut update = match posterior {
             Some(posterior) => self.sample(posterior, rng),
             None => self.reweight_widely(scan, attitude, rng)?,
         };
@@ -44,9 +49,10 @@ impl ParticleFilter {
         let mut evidence = self.evidence(&estimate, odometry);
         let is_found = evidence.is_confirmed && !self.phase.is_tracking();
         if is_found
-            && let Some(better) = self.better_next_to_particles(scan, &update.attitude, rng)?
+            && let Some(posterior) = self.propose(scan, &update.attitude, None, rng)?
+            && posterior.refutes
         {
-            update = self.sample(better, rng);
+            update = self.sample(posterior, rng);
             estimate = self.compared_estimate(&update)?;
         }
         if update.refutes {
