@@ -259,6 +259,16 @@ impl RangeRenderer for Counting {
         self.inner.cast(poses, directions, until_m)
     }
 
+    fn cast_signed(
+        &self,
+        pose: &Pose3,
+        directions: &[Vec3],
+        until_m: f32,
+    ) -> Result<Vec<f32>, RenderError> {
+        self.count(directions.len());
+        self.inner.cast_signed(pose, directions, until_m)
+    }
+
     fn surfaces(
         &self,
         pose: &Pose3,

@@ -27,8 +27,15 @@ const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Raster];
 /// A renderer on any adapter; `None`, with a message, without one.
 #[track_caller]
 fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
+    renderer_of(tiles, false)
+}
+
+#[track_caller]
+fn renderer_of(tiles: &[TriangleMesh], has_fronts: bool) -> Option<GpuRenderer> {
+    let mut scene = Scene::of_tiles(tiles);
+    scene.has_fronts = has_fronts;
     match GpuRenderer::new(
-        Arc::new(Scene::of_tiles(tiles)),
+        Arc::new(scene),
         (Backend::Gpu, RenderingMethod::Auto),
         MemoryBudget::default(),
     ) {
@@ -176,6 +183,33 @@ fn rays_in_any_direction_agree_with_brute_force() {
         assert_ranges_agree(&truth, pose, &directions, row, "cast");
     }
     assert!(rows[0].contains(&f32::INFINITY));
+}
+
+#[test]
+fn backs_of_surfaces_are_those_of_the_cpu() {
+    let directions = small_model().directions();
+    for has_fronts in [true, false] {
+        let Some(gpu) = renderer_of(&street(), has_fronts) else {
+            return;
+        };
+        let mut scene = Scene::of_tiles(&street());
+        scene.has_fronts = has_fronts;
+        let cpu = CpuRenderer::over(Arc::new(scene));
+        let (mut fronts, mut backs) = (0, 0);
+        for pose in street_poses() {
+            let [on_gpu, on_cpu] = [&gpu as &dyn RangeRenderer, &cpu]
+                .map(|it| it.cast_signed(&pose, &directions, 80.0).unwrap());
+            // A ray at an edge may hit either of its triangles.
+            let differ = |(a, b): &(&f32, &f32)| a != b && (*a - *b).abs() > 1e-3;
+            let pairs = on_gpu.iter().zip(&on_cpu);
+            assert!(pairs.filter(differ).count() < directions.len() / 200);
+            backs += on_gpu.iter().filter(|range_m| **range_m < 0.0).count();
+            fronts += on_gpu.iter().filter(|range_m| range_m.is_finite()).count();
+        }
+        // The boxes of this street have both.
+        assert_eq!(backs > 500, has_fronts, "{backs}");
+        assert!(fronts - backs > 500, "{fronts}");
+    }
 }
 
 #[test]

@@ -258,7 +258,8 @@ pub fn ground_patch_of(
     Ok(patch.or(remembered.copied()))
 }
 
-/// Ranges of the map along beams from a pose, as far as their [`agreement`] depends on them [m].
+/// [Signed](RangeRenderer::cast_signed) ranges of the map along beams from a pose, as far as their [`agreement`] depends on them
+/// [m].
 pub fn ranges_along(
     renderer: &dyn RangeRenderer,
     map_from_lidar: &Pose3,
@@ -268,19 +269,22 @@ pub fn ranges_along(
     let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
     let farthest_m = beams.iter().map(|beam| beam.range_m).fold(0.0, f32::max);
     let until_m = farthest_m + 2.0 * tolerance_m;
-    let mut rows = renderer.cast(&[*map_from_lidar], &directions, until_m)?;
-    Ok(rows.pop().unwrap_or_default())
+    renderer.cast_signed(map_from_lidar, &directions, until_m)
 }
 
 /// Whether a beam agrees with the map: its measured and its rendered range differ by the tolerance at most. `None` if it does
-/// not count: beams along which the map has no surface, and those that end far in front of it, on traffic. Those that end within
+/// not count: beams along which the map has no surface, those that end far in front of it, on traffic, and those that end at the back
+/// of a surface or in front of it. Those that end within
 /// a quarter of the range in front of it disagree: they show a wrong pose, or ranges that are too short.
-fn agrees(beam: &Beam, rendered_m: f32, tolerance_m: f32) -> Option<bool> {
+fn agrees(beam: &Beam, signed_m: f32, tolerance_m: f32) -> Option<bool> {
     /// Largest distance of a return to the surface behind it that counts, as a share of the range of the surface.
     const NEAR: f32 = 0.25;
+    let rendered_m = signed_m.abs();
     let excess_m = beam.range_m - rendered_m;
     let is_traffic = excess_m < -tolerance_m && -excess_m > NEAR * rendered_m;
-    let counts = rendered_m != f32::INFINITY && !is_traffic;
+    // The mapping drive did not see what is there: a wall has another side.
+    let is_unseen = signed_m < 0.0 && excess_m <= tolerance_m;
+    let counts = rendered_m != f32::INFINITY && !is_traffic && !is_unseen;
     counts.then(|| excess_m.abs() <= tolerance_m)
 }
 
@@ -297,7 +301,7 @@ pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option
     (counted >= MIN_BEAMS).then(|| on as f64 / counted as f64)
 }
 
-/// Whether beams agree with the map much better at one pose than at another, by its ranges along them there and here [m]. Of the
+/// Whether beams agree with the map much better at one pose than at another, by its signed ranges along them there and here [m]. Of the
 /// beams that count at both poses, those gained less those lost are at least half of those that disagree here, and exceed chance by
 /// six standard deviations (McNemar, *Note on the sampling error of the difference between correlated proportions or percentages*,
 /// 1947).
@@ -330,12 +334,16 @@ pub fn above_road(beams: &[Beam], attitude: &SensorAttitude, clearance_m: f32) -
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use approx::assert_relative_eq;
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
-    use crate::geometry::Pose2;
+    use crate::geometry::{Pose2, TriangleMesh};
     use crate::map::world_for_tests::TestWorld;
+    use crate::raycasting::Scene;
+    use crate::rendering::CpuRenderer;
 
     #[test]
     fn the_reference_likelihood_is_the_published_one() {
@@ -451,6 +459,43 @@ mod tests {
             assert_relative_eq!(beam.range_m, *range_m, epsilon = 1e-3);
         }
         assert_eq!(agreement(&beams, &found, 0.3), Some(1.0));
+    }
+
+    #[test]
+    fn beams_up_to_the_back_of_a_wall_do_not_count_and_those_through_it_disagree() {
+        // Two walls across the x axis that face ahead: the one behind the sensor shows its front. The other was mapped from its
+        // other side, and is 0.4 m thick.
+        let wall = |x: f32| TriangleMesh {
+            vertices: [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
+                .map(|(y, z)| Vec3::new(x, y, z))
+                .to_vec(),
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..TriangleMesh::default()
+        };
+        let beams: Vec<Beam> = (0..80_u8)
+            .map(|i| {
+                let ahead = if i % 2 == 0 { 1.0 } else { -1.0 };
+                let direction = Vec3::new(ahead, 0.005 * f32::from(i), 0.0).normalize();
+                let range_m = if ahead > 0.0 { 4.6 } else { 6.0 } / direction.x.abs();
+                Beam { direction, range_m }
+            })
+            .collect();
+        let through = |beam: &Beam| Beam {
+            range_m: beam.range_m + if beam.direction.x > 0.0 { 1.0 } else { 0.0 },
+            ..*beam
+        };
+        let through: Vec<Beam> = beams.iter().map(through).collect();
+        for (beams, has_fronts, expected) in [
+            (&beams, true, 1.0),
+            (&beams, false, 0.5),
+            (&through, true, 0.5),
+        ] {
+            let mut scene = Scene::of_tiles(&[wall(5.0), wall(-6.0)]);
+            scene.has_fronts = has_fronts;
+            let renderer = CpuRenderer::over(Arc::new(scene));
+            let ranges = ranges_along(&renderer, &Pose3::identity(), beams, 0.3).unwrap();
+            assert_eq!(agreement(beams, &ranges, 0.3), Some(expected));
+        }
     }
 
     #[test]

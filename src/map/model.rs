@@ -137,8 +137,9 @@ impl Map {
             grid::cut(&mesh, options.tiles.side_m).into_iter().unzip();
         let boxes = std::iter::zip(indices, parts.iter().map(TriangleMesh::bounds));
         let tiles = grid_of(&path, boxes, &options.tiles);
-        let scene = Arc::new(Scene::of_tiles(&parts));
-        let renderer = choice.renderer(scene, options.memory_budget)?;
+        let mut scene = Scene::of_tiles(&parts);
+        scene.has_fronts = path.has_fronts();
+        let renderer = choice.renderer(Arc::new(scene), options.memory_budget)?;
         let ground = (0..mesh.triangles.len()).filter(|&triangle| is_ground[triangle]);
         let corners = ground.map(|triangle| MeshView::corners(&mesh, triangle));
         let ground = GroundTriangles::new(corners.collect(), GROUND_CELL_M);
@@ -561,12 +562,15 @@ mod tests {
     use std::fs::File;
     use std::time::{Duration, SystemTime};
 
+    use approx::assert_relative_eq;
+
     use super::*;
     use crate::geometry::Pose3;
     use crate::lidar::LidarModel;
     use crate::map::places::panorama::{PanoramaConfig, SearchRegion};
     use crate::map::tiles::contents::{CacheKind, files_of};
     use crate::rendering::Backend;
+    use crate::sensor::Sensor;
 
     /// A road of 100 m, 12 m wide, between walls of 6 m.
     fn street() -> TriangleMesh {
@@ -614,6 +618,40 @@ mod tests {
         let message = prepared(small).err().unwrap().to_string();
         assert!(message.starts_with("the map would need"), "{message}");
         prepared(MemoryBudget::default()).unwrap();
+    }
+
+    #[test]
+    fn walls_of_a_map_of_scans_are_seen_from_their_front_and_others_from_both_sides() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("map.ply");
+        let options = MapOptions {
+            backend: Backend::Cpu,
+            cache: MapCache::NextToMap,
+            ..MapOptions::default()
+        };
+        for sensor in [Some(Sensor::hdl32e()), None] {
+            let path = MappingPath {
+                sensor,
+                map_from_lidar: vec![Pose3::translation(20.0, 0.0, 2.0)],
+                ..MappingPath::default()
+            };
+            ply::write(&file, &street(), Some(&path)).unwrap();
+            // The other wall faces away from the road.
+            let sign = if path.has_fronts() { -1.0 } else { 1.0 };
+            let maps = [
+                Map::new(street(), path, &options),
+                Map::load(&file, &options),
+            ];
+            for map in maps.map(Result::unwrap) {
+                let directions = [Vec3::NEG_Z, Vec3::Y, Vec3::NEG_Y];
+                let here = Pose3::translation(50.2, 0.1, 2.0);
+                let found = map.renderer.cast_signed(&here, &directions, 80.0);
+                let expected = [2.0, 5.9, sign * 6.1];
+                for (found, expected) in found.unwrap().into_iter().zip(expected) {
+                    assert_relative_eq!(found, expected, epsilon = 1e-3);
+                }
+            }
+        }
     }
 
     #[test]

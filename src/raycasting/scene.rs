@@ -27,6 +27,8 @@ use crate::geometry::{Aabb, TriangleMesh};
 pub struct Scene<E = Infallible> {
     top: Arc<Top>,
     tiles: Arc<dyn TileSource<E>>,
+    /// Whether its triangles have [fronts](super::SceneSource::has_fronts).
+    pub has_fronts: bool,
 }
 
 /// Supplies the tiles of a scene when rays enter their boxes.
@@ -126,6 +128,7 @@ impl<E> Scene<E> {
         Self {
             top: top.into(),
             tiles,
+            has_fronts: false,
         }
     }
 
@@ -135,6 +138,7 @@ impl<E> Scene<E> {
         Self {
             top: self.top.clone(),
             tiles,
+            has_fronts: self.has_fronts,
         }
     }
 

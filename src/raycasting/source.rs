@@ -22,6 +22,9 @@ pub trait SceneSource: Debug + Send + Sync {
     /// # Errors
     /// [`TileError`] if the tile cannot be read.
     fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, TileError>;
+
+    /// Whether a triangle is the surface only of what it faces, by the right-hand rule, and says nothing about what is behind it.
+    fn has_fronts(&self) -> bool;
 }
 
 impl SceneSource for Scene<TileError> {
@@ -39,5 +42,9 @@ impl SceneSource for Scene<TileError> {
             .all_tiles()
             .nth(tile)
             .map_or_else(Vec::new, Tile::corners))
+    }
+
+    fn has_fronts(&self) -> bool {
+        self.has_fronts
     }
 }

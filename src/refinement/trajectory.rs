@@ -270,7 +270,7 @@ pub struct TrajectoryRefiner {
     correction: Option<Pose2>,
 }
 
-/// The beams of a scan, and how far the map is along them from a pose.
+/// The beams of a scan, and the signed ranges of the map along them from a pose.
 struct Comparison {
     beams: Vec<Beam>,
     rendered_m: Vec<f32>,
@@ -301,7 +301,7 @@ impl Comparison {
         /// Least share of agreeing beams among all.
         const MIN_SHARE: f64 = 0.4;
         let is_hit = |(beam, rendered_m): &(&Beam, &f32)| {
-            (beam.range_m - **rendered_m).abs() <= self.config.tolerance_m
+            (beam.range_m - rendered_m.abs()).abs() <= self.config.tolerance_m
         };
         let hits = self
             .beams

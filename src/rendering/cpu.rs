@@ -156,6 +156,30 @@ impl CpuRenderer {
         Ok(sums.into_iter().map(mean).collect())
     }
 
+    /// What `of_hit` makes of the nearest hit of each beam of one pose, in the order of the beams.
+    fn of_hits<T: Clone + Default + Send>(
+        &self,
+        map_from_lidar: &Pose3,
+        beams: &CastBeams,
+        of_hit: impl Fn(&Scene<TileError>, usize, &Hit) -> Result<T, TileError> + Sync,
+    ) -> Result<Vec<T>, RenderError> {
+        let grouping = Grouping::of(&[*map_from_lidar], beams);
+        let scene = self.scenes.scene(&[origin_of(map_from_lidar)]);
+        let pieces: Vec<Vec<T>> = (beams.order)
+            .par_chunks(RAYS_PER_PIECE)
+            .map(|rays| {
+                let hits = hits(&scene, map_from_lidar, rays, beams, grouping)?;
+                let of_ray = |(&ray, hit): (&u32, &Hit)| of_hit(&scene, ray as usize, hit);
+                rays.iter().zip(&hits).map(of_ray).collect()
+            })
+            .collect::<Result<_, TileError>>()?;
+        let mut results = vec![T::default(); beams.order.len()];
+        for (&ray, found) in beams.order.iter().zip(pieces.into_iter().flatten()) {
+            results[ray as usize] = found;
+        }
+        Ok(results)
+    }
+
     /// Ranges of every pose, in the order of the beams.
     fn ranges(
         &self,
@@ -333,6 +357,24 @@ impl RangeRenderer for CpuRenderer {
         self.ranges(map_from_lidar, &beams)
     }
 
+    fn cast_signed(
+        &self,
+        map_from_lidar: &Pose3,
+        directions: &[Vec3],
+        until_m: f32,
+    ) -> Result<Vec<f32>, RenderError> {
+        let beams = CastBeams::until(directions, until_m);
+        let has_fronts = self.scenes.has_fronts();
+        let rotation = rotation_of(map_from_lidar);
+        let range_m = |scene: &Scene<TileError>, ray: usize, hit: &Hit| {
+            let is_behind = |normal: Vec3| normal.dot(rotation * directions[ray]) > 0.0;
+            let is_behind =
+                has_fronts && hit.range_m.is_finite() && scene.normal(hit)?.is_some_and(is_behind);
+            Ok(if is_behind { -hit.range_m } else { hit.range_m })
+        };
+        self.of_hits(map_from_lidar, &beams, range_m)
+    }
+
     /// The normals are those of the triangles themselves.
     fn surfaces(
         &self,
@@ -341,11 +383,9 @@ impl RangeRenderer for CpuRenderer {
         within_m: f32,
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
         let to_cast = CastBeams::new(beams, |beam| reach_near_end(beam, within_m));
-        let grouping = Grouping::of(&[*map_from_lidar], &to_cast);
-        let scene = self.scenes.scene(&[origin_of(map_from_lidar)]);
         let rotation = rotation_of(map_from_lidar);
-        let surface = |(&ray, hit): (&u32, &Hit)| {
-            let beam = &beams[ray as usize];
+        let surface = |scene: &Scene<TileError>, ray: usize, hit: &Hit| {
+            let beam = &beams[ray];
             if !is_near_end(beam, hit.range_m, within_m) {
                 return Ok(None);
             }
@@ -355,18 +395,7 @@ impl RangeRenderer for CpuRenderer {
             });
             Ok(found)
         };
-        let pieces: Vec<Vec<Option<SurfaceHit>>> = (to_cast.order)
-            .par_chunks(RAYS_PER_PIECE)
-            .map(|rays| {
-                let hits = hits(&scene, map_from_lidar, rays, &to_cast, grouping)?;
-                rays.iter().zip(&hits).map(surface).collect()
-            })
-            .collect::<Result<_, TileError>>()?;
-        let mut surfaces = vec![None; beams.len()];
-        for (&ray, found) in to_cast.order.iter().zip(pieces.into_iter().flatten()) {
-            surfaces[ray as usize] = found;
-        }
-        Ok(surfaces)
+        self.of_hits(map_from_lidar, &to_cast, surface)
     }
 
     fn compare(

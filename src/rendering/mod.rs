@@ -47,6 +47,21 @@ pub trait RangeRenderer: Send + Sync {
         until_m: f32,
     ) -> Result<Vec<Vec<f32>>, RenderError>;
 
+    /// [Ranges](Self::cast) from one pose, negative where the nearest surface is seen from behind [m]. In a map whose surfaces have
+    /// no fronts, and by default, none is.
+    ///
+    /// # Errors
+    /// As [`render`](Self::render).
+    fn cast_signed(
+        &self,
+        map_from_lidar: &Pose3,
+        directions: &[Vec3],
+        until_m: f32,
+    ) -> Result<Vec<f32>, RenderError> {
+        let mut rows = self.cast(&[*map_from_lidar], directions, until_m)?;
+        Ok(rows.pop().unwrap_or_default())
+    }
+
     /// The surfaces that measured beams end on: the nearest surface along each, with its normal, if it is not farther than
     /// `within_m` from the end of the beam.
     ///

@@ -45,6 +45,11 @@ pub struct MappingPath {
 pub struct BadPathComment(String);
 
 impl MappingPath {
+    /// Whether the triangles of the map have fronts: surfaces that are built of scans face the sensor.
+    pub(crate) fn has_fronts(&self) -> bool {
+        self.sensor.is_some()
+    }
+
     /// Returns the comments of the PLY file.
     pub(crate) fn to_comments(&self) -> Vec<String> {
         let line = |key: &str, pose: &Pose3| {

@@ -289,10 +289,12 @@ impl TileStore {
             slots: files.tiles.iter().map(|_| OnceLock::new()).collect(),
             files: files.clone(),
         });
+        let mut scene = Scene::over(&bounds, first_triangles, Arc::new(Vec::new()));
+        scene.has_fronts = index.path.as_ref().is_some_and(MappingPath::has_fronts);
         Self {
             files,
             path: index.path,
-            scene: Scene::over(&bounds, first_triangles, Arc::new(Vec::new())),
+            scene,
             resident: RwLock::new(resident),
             is_reading_ahead: Arc::default(),
         }
@@ -459,6 +461,10 @@ impl SceneSource for TileStore {
         let scene = loaded.scene.get_or_init(|| self.files.scene_of(&loaded));
         let tile = &scene.as_ref().map_err(TileError::clone)?.tile;
         Ok(tile.as_ref().map_or_else(Vec::new, Tile::corners))
+    }
+
+    fn has_fronts(&self) -> bool {
+        self.scene.has_fronts
     }
 }
 

@@ -229,6 +229,46 @@ fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
 }
 
 #[test]
+fn a_wall_that_is_seen_from_behind_hides_another_and_has_a_negative_range() {
+    // Across the x axis, facing ahead or back by the order of the corners.
+    let wall = |x: f32, faces_ahead: bool| TriangleMesh {
+        vertices: [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
+            .map(|(y, z)| Vec3::new(x, y, z))
+            .to_vec(),
+        triangles: [[0, 1, 2], [0, 2, 3]]
+            .map(|[a, b, c]| if faces_ahead { [a, b, c] } else { [a, c, b] })
+            .to_vec(),
+        ..TriangleMesh::default()
+    };
+    let directions = [Vec3::X, Vec3::NEG_X, Vec3::Y];
+    let half_a_turn = UnitQuaternion::from_euler_angles(0.0, 0.0, std::f64::consts::PI);
+    for (yaw, near_faces_ahead, has_fronts, expected) in [
+        (UnitQuaternion::identity(), true, true, [-5.0, 6.0]),
+        (UnitQuaternion::identity(), false, true, [5.0, 6.0]),
+        (UnitQuaternion::identity(), true, false, [5.0, 6.0]),
+        (half_a_turn, true, true, [6.0, -5.0]),
+    ] {
+        let mut scene = Scene::of_tiles(&[
+            wall(5.0, near_faces_ahead),
+            wall(8.0, false),
+            wall(-6.0, true),
+        ]);
+        scene.has_fronts = has_fronts;
+        let renderer = CpuRenderer::over(Arc::new(scene));
+        let pose = Pose3::from_parts(Translation3::identity(), yaw);
+        let signed = |until_m| renderer.cast_signed(&pose, &directions, until_m).unwrap();
+        let [ahead_m, behind_m] = expected;
+        assert_eq!(signed(50.0), [ahead_m, behind_m, f32::INFINITY]);
+        assert_eq!(signed(4.0), [f32::INFINITY; 3]);
+        let ranges = renderer.cast(&[pose], &directions, 50.0).unwrap();
+        assert_eq!(
+            ranges,
+            [signed(50.0).into_iter().map(f32::abs).collect::<Vec<_>>()]
+        );
+    }
+}
+
+#[test]
 fn normals_from_three_rays_are_those_of_the_triangles() {
     /// Casts as another renderer does, and knows nothing of triangles.
     struct WithoutTriangles(CpuRenderer);

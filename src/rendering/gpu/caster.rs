@@ -80,7 +80,7 @@ impl Caster {
     }
 
     /// Ranges along directions of the lidar frame, one row per pose; [`FAR`] or more where no
-    /// surface is nearer than `far_m`.
+    /// surface is nearer than `far_m`, and negative where one is seen from behind.
     pub fn cast(
         &self,
         gpu: &Gpu,

@@ -1,5 +1,5 @@
-// Ray casting through a bounding volume hierarchy, nearer child first; ranges are written
-// (`cast_rays`) or compared with measured ones (`compare_beams`).
+// Ray casting through a bounding volume hierarchy, nearer child first; ranges are written (`cast_rays`; with a minus where a
+// surface is seen from behind) or compared with measured ones (`compare_beams`).
 //
 // `ray.wgsl` is prepended to this text; `cost.wgsl` is prepended to this text; `sum.wgsl` is prepended to this text.
 // Keep in sync with `layout.rs`: `Node`, `Query`, `LEAF`, `BEAMS_PER_GROUP`, and the bits of a node reference; `STACK_SIZE` is replaced by
@@ -65,10 +65,16 @@ fn inverse_of(direction: vec3f) -> vec3f {
     return 1.0 / select(direction, tiny, abs(direction) < tiny);
 }
 
-// Range of the nearest surface before `far_m`; any that is at most `enough_m` will do.
-fn nearest(pose: Pose, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
+struct Hit {
+    // FAR without a triangle.
+    range_m: f32,
+    triangle: u32,
+}
+
+// The nearest surface before `far_m`; any that is at most `enough_m` away will do.
+fn nearest(pose: Pose, direction: vec3f, far_m: f32, enough_m: f32) -> Hit {
     let inverse = inverse_of(direction);
-    var best = far_m;
+    var best = Hit(far_m, 0u);
     var stack: array<u32, STACK_SIZE>;
     var stack_near: array<f32, STACK_SIZE>;
     var depth = 0u;
@@ -78,15 +84,18 @@ fn nearest(pose: Pose, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
             let first = child & 0x0fffffffu;
             let end = first + ((child >> 28u) & 7u);
             for (var i = first; i < end; i++) {
-                best = min(best, range_to(triangles[i], pose, direction));
+                let range_m = range_to(triangles[i], pose, direction);
+                if range_m < best.range_m {
+                    best = Hit(range_m, i);
+                }
             }
-            if best <= enough_m {
+            if best.range_m <= enough_m {
                 return best;
             }
         } else {
             let node = nodes[child];
-            let left = entry(node.left_min, node.left_max, pose, inverse, best);
-            let right = entry(node.right_min, node.right_max, pose, inverse, best);
+            let left = entry(node.left_min, node.left_max, pose, inverse, best.range_m);
+            let right = entry(node.right_min, node.right_max, pose, inverse, best.range_m);
             let left_first = left <= right;
             if min(left, right) < FAR {
                 if max(left, right) < FAR {
@@ -102,14 +111,17 @@ fn nearest(pose: Pose, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
         var found = false;
         while depth > 0u && !found {
             depth--;
-            found = stack_near[depth] < best;
+            found = stack_near[depth] < best.range_m;
         }
         if !found {
             break;
         }
         child = stack[depth];
     }
-    return select(best, FAR, best >= far_m);
+    if best.range_m >= far_m {
+        best.range_m = FAR;
+    }
+    return best;
 }
 
 @compute @workgroup_size(64)
@@ -120,8 +132,9 @@ fn cast_rays(@builtin(global_invocation_id) id: vec3u) {
     let pose = poses[id.y];
     let ray = rays[id.x];
     let direction = direction_in_map(pose, ray.xyz);
-    let range_m = nearest(pose, direction, query.far_m, -1.0);
-    results[id.y * query.rays + bitcast<u32>(ray.w)] = range_m;
+    let hit = nearest(pose, direction, query.far_m, -1.0);
+    let is_behind = hit.range_m < FAR && dot(normal_of(triangles[hit.triangle]), direction) > 0.0;
+    results[id.y * query.rays + bitcast<u32>(ray.w)] = select(hit.range_m, -hit.range_m, is_behind);
 }
 
 // A ray is traced only as far as it can change the cost: a surface nearer than measured - long_m
@@ -135,7 +148,7 @@ fn cost_of(pose: Pose, beam: vec4f) -> f32 {
     let far_m = select(query.far_m, min(query.far_m, measured_m + limits.short_m), nothing_is_short);
     let direction = direction_in_map(pose, beam.xyz);
     let enough_m = select(measured_m - limits.long_m, -1.0, query.min_m > 0.0);
-    let range_m = nearest(pose, direction, far_m, enough_m);
+    let range_m = nearest(pose, direction, far_m, enough_m).range_m;
     return cost(measured_m, select(FAR, range_m, range_m > query.min_m), limits);
 }
 

@@ -63,6 +63,8 @@ pub struct GpuRenderer {
     rasterizer: Option<Rasterizer>,
     /// Method of the images that are compared; empty until it has been measured.
     method: OnceLock<ImageMethod>,
+    /// As in [`SceneSource`].
+    has_fronts: bool,
 }
 
 impl GpuRenderer {
@@ -81,6 +83,7 @@ impl GpuRenderer {
         let mut gpu = Gpu::open(backend)?;
         gpu.memory_budget = memory_budget;
         gpu.batch_sizes.poses = gpu.batch_sizes.poses.min(POSES_AT_ONCE);
+        let has_fronts = source.has_fronts();
         let map = ResidentMap::new(&gpu, source)?;
         let rasterizer = gpu.can_rasterize.then(|| Rasterizer::new(&gpu));
         gpu.check()?;
@@ -95,6 +98,7 @@ impl GpuRenderer {
             map,
             rasterizer,
             method,
+            has_fronts,
         })
     }
 
@@ -123,6 +127,30 @@ impl GpuRenderer {
         Ok(results.into_iter().flatten().collect())
     }
 
+    /// Ranges along directions, one row per pose, negative where a surface with a front is seen from behind [m]; or what the
+    /// CPU finds.
+    fn signed_ranges(
+        &self,
+        map_from_lidar: &[Pose3],
+        directions: &[Vec3],
+        until_m: f32,
+        on_cpu: impl FnOnce(&CpuRenderer) -> Result<Vec<Vec<f32>>, RenderError>,
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
+        let cast = |loaded: &Loaded, poses: &[Pose]| {
+            let rays = (directions, until_m);
+            loaded.caster.cast(&self.gpu, &loaded.map, poses, rays)
+        };
+        let mut rows = self.render_within(map_from_lidar, until_m, cast, on_cpu)?;
+        for range_m in rows.iter_mut().flatten() {
+            if *range_m >= until_m.min(FAR) {
+                *range_m = f32::INFINITY;
+            } else if !self.has_fronts {
+                *range_m = range_m.abs();
+            }
+        }
+        Ok(rows)
+    }
+
     /// [`RangeRenderer::render`] by a given method.
     ///
     /// # Errors
@@ -148,6 +176,7 @@ impl GpuRenderer {
         let on_cpu = |cpu: &CpuRenderer| cpu.render(map_from_lidar, model);
         let mut images = self.render_within(map_from_lidar, model.max_range, draw, on_cpu)?;
         for range_m in images.iter_mut().flatten() {
+            *range_m = range_m.abs();
             if *range_m >= FAR || !model.accepts_range(*range_m) {
                 *range_m = f32::INFINITY;
             }
@@ -254,18 +283,24 @@ impl RangeRenderer for GpuRenderer {
         directions: &[Vec3],
         until_m: f32,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let cast = |loaded: &Loaded, poses: &[Pose]| {
-            let rays = (directions, until_m);
-            loaded.caster.cast(&self.gpu, &loaded.map, poses, rays)
-        };
         let on_cpu = |cpu: &CpuRenderer| cpu.cast(map_from_lidar, directions, until_m);
-        let mut rows = self.render_within(map_from_lidar, until_m, cast, on_cpu)?;
+        let mut rows = self.signed_ranges(map_from_lidar, directions, until_m, on_cpu)?;
         for range_m in rows.iter_mut().flatten() {
-            if *range_m >= until_m.min(FAR) {
-                *range_m = f32::INFINITY;
-            }
+            *range_m = range_m.abs();
         }
         Ok(rows)
+    }
+
+    fn cast_signed(
+        &self,
+        map_from_lidar: &Pose3,
+        directions: &[Vec3],
+        until_m: f32,
+    ) -> Result<Vec<f32>, RenderError> {
+        let poses = [*map_from_lidar];
+        let on_cpu = |cpu: &CpuRenderer| Ok(vec![cpu.cast_signed(&poses[0], directions, until_m)?]);
+        let mut rows = self.signed_ranges(&poses, directions, until_m, on_cpu)?;
+        Ok(rows.pop().unwrap_or_default())
     }
 
     fn compare(

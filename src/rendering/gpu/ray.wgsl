@@ -38,6 +38,11 @@ fn side_of_edge(p: vec3f, q: vec3f, direction: vec3f) -> f32 {
     return dot(cross(p + q, q - p), direction);
 }
 
+// Towards its front, not of unit length.
+fn normal_of(triangle: Triangle) -> vec3f {
+    return cross(triangle.b.xyz - triangle.a.xyz, triangle.c.xyz - triangle.a.xyz);
+}
+
 // Distance along a unit direction to a triangle, from either of its sides; FAR where it is
 // missed. The distance is that to the plane of the triangle.
 fn range_to(triangle: Triangle, pose: Pose, direction: vec3f) -> f32 {
@@ -50,7 +55,7 @@ fn range_to(triangle: Triangle, pose: Pose, direction: vec3f) -> f32 {
     if min(u, min(v, w)) < 0.0 && max(u, max(v, w)) > 0.0 {
         return FAR;
     }
-    let normal = cross(triangle.b.xyz - triangle.a.xyz, triangle.c.xyz - triangle.a.xyz);
+    let normal = normal_of(triangle);
     let slope = dot(normal, direction);
     if slope == 0.0 {
         return FAR;
