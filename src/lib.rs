@@ -69,7 +69,7 @@
 //! # Layers
 //!
 //! The modules below are in layers. A module imports modules of the layers above its own, and none of
-//! its own layer or of those below it; `tests/architecture.rs` checks this.
+//! its own layer or of those below it; `tests/commands/architecture.rs` checks this.
 //!
 //! | layer | modules |
 //! |---|---|
