@@ -179,6 +179,19 @@ impl Aabb {
 }
 
 #[cfg(test)]
+impl TriangleMesh {
+    /// A wall of 18 x 18 m across the x axis, whose front faces ahead.
+    pub(crate) fn wall(x_m: f32) -> Self {
+        let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
+        Self {
+            vertices: corners.map(|(y, z)| Vec3::new(x_m, y, z)).to_vec(),
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..Self::default()
+        }
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use super::*;
 

@@ -272,10 +272,10 @@ pub fn ranges_along(
     renderer.cast_signed(map_from_lidar, &directions, until_m)
 }
 
-/// Whether a beam agrees with the map: its measured and its rendered range differ by the tolerance at most. `None` if it does
-/// not count: beams along which the map has no surface, those that end far in front of it, on traffic, and those that end at the back
-/// of a surface or in front of it. Those that end within
-/// a quarter of the range in front of it disagree: they show a wrong pose, or ranges that are too short.
+/// Whether a beam agrees with the map: its measured and its rendered range differ by the tolerance at most. `None` if it does not
+/// count: beams along which the map has no surface, those that end far in front of it, on traffic, and those that end at the back of
+/// a surface or in front of it. Those that end within a quarter of the range in front of a surface that is seen from its front
+/// disagree: they show a wrong pose, or ranges that are too short.
 fn agrees(beam: &Beam, signed_m: f32, tolerance_m: f32) -> Option<bool> {
     /// Largest distance of a return to the surface behind it that counts, as a share of the range of the surface.
     const NEAR: f32 = 0.25;
@@ -465,13 +465,7 @@ mod tests {
     fn beams_up_to_the_back_of_a_wall_do_not_count_and_those_through_it_disagree() {
         // Two walls across the x axis that face ahead: the one behind the sensor shows its front. The other was mapped from its
         // other side, and is 0.4 m thick.
-        let wall = |x: f32| TriangleMesh {
-            vertices: [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
-                .map(|(y, z)| Vec3::new(x, y, z))
-                .to_vec(),
-            triangles: vec![[0, 1, 2], [0, 2, 3]],
-            ..TriangleMesh::default()
-        };
+        let walls = [5.0, -6.0].map(TriangleMesh::wall);
         let beams: Vec<Beam> = (0..80_u8)
             .map(|i| {
                 let ahead = if i % 2 == 0 { 1.0 } else { -1.0 };
@@ -490,7 +484,7 @@ mod tests {
             (&beams, false, 0.5),
             (&through, true, 0.5),
         ] {
-            let mut scene = Scene::of_tiles(&[wall(5.0), wall(-6.0)]);
+            let mut scene = Scene::of_tiles(&walls);
             scene.has_fronts = has_fronts;
             let renderer = CpuRenderer::over(Arc::new(scene));
             let ranges = ranges_along(&renderer, &Pose3::identity(), beams, 0.3).unwrap();

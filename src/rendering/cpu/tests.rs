@@ -183,14 +183,7 @@ fn beams_along(directions: &[Vec3]) -> Vec<Beam> {
 
 #[test]
 fn only_surfaces_near_the_ends_of_beams_are_found() {
-    let wall = |x: f32| TriangleMesh {
-        vertices: [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
-            .map(|(y, z)| Vec3::new(x, y, z))
-            .to_vec(),
-        triangles: vec![[0, 1, 2], [0, 2, 3]],
-        ..TriangleMesh::default()
-    };
-    let renderer = CpuRenderer::new(&[wall(5.0), wall(8.0)]);
+    let renderer = CpuRenderer::new(&[TriangleMesh::wall(5.0), TriangleMesh::wall(8.0)]);
     let found = |range_m: f32, within_m: f32| {
         let beam = Beam {
             direction: Vec3::X,
@@ -209,13 +202,7 @@ fn only_surfaces_near_the_ends_of_beams_are_found() {
 
 #[test]
 fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
-    let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
-    let wall = TriangleMesh {
-        vertices: corners.map(|(y, z)| Vec3::new(5.0, y, z)).to_vec(),
-        triangles: vec![[0, 1, 2], [0, 2, 3]],
-        ..TriangleMesh::default()
-    };
-    let renderer = CpuRenderer::new(&[wall]);
+    let renderer = CpuRenderer::new(&[TriangleMesh::wall(5.0)]);
     let quarter = UnitQuaternion::from_euler_angles(0.0, 0.0, std::f64::consts::FRAC_PI_2);
     let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), quarter);
     // Ahead of the turned sensor is +y of the map, so +x is on its right.
@@ -230,15 +217,12 @@ fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
 
 #[test]
 fn a_wall_that_is_seen_from_behind_hides_another_and_has_a_negative_range() {
-    // Across the x axis, facing ahead or back by the order of the corners.
-    let wall = |x: f32, faces_ahead: bool| TriangleMesh {
-        vertices: [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
-            .map(|(y, z)| Vec3::new(x, y, z))
-            .to_vec(),
-        triangles: [[0, 1, 2], [0, 2, 3]]
-            .map(|[a, b, c]| if faces_ahead { [a, b, c] } else { [a, c, b] })
-            .to_vec(),
-        ..TriangleMesh::default()
+    let wall = |x: f32, faces_ahead: bool| {
+        let mut wall = TriangleMesh::wall(x);
+        if !faces_ahead {
+            wall.triangles.iter_mut().for_each(|it| it.swap(1, 2));
+        }
+        wall
     };
     let directions = [Vec3::X, Vec3::NEG_X, Vec3::Y];
     let half_a_turn = UnitQuaternion::from_euler_angles(0.0, 0.0, std::f64::consts::PI);
@@ -308,13 +292,7 @@ fn normals_from_three_rays_are_those_of_the_triangles() {
             self.0.compare_images(poses, measured, difference)
         }
     }
-    let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
-    let wall = TriangleMesh {
-        vertices: corners.map(|(y, z)| Vec3::new(5.0, y, z)).to_vec(),
-        triangles: vec![[0, 1, 2], [0, 2, 3]],
-        ..TriangleMesh::default()
-    };
-    let renderer = CpuRenderer::new(&[wall]);
+    let renderer = CpuRenderer::new(&[TriangleMesh::wall(5.0)]);
     let turned = UnitQuaternion::from_euler_angles(0.1, -0.2, 0.3);
     let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), turned);
     let directions = [Vec3::X, Vec3::new(0.8, 0.6, 0.0), Vec3::NEG_X, Vec3::Y];
