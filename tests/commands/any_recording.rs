@@ -3,7 +3,6 @@
 use std::fs;
 use std::path::Path;
 
-use crate::common::{Fpmcl, Output, fpmcl, json, real_recording, run, simulate_two_drives};
 use fpmcl::geometry::{Pose3, StampedPose};
 use fpmcl::internals::app::LocalizationResults;
 use fpmcl::internals::ply;
@@ -12,6 +11,8 @@ use fpmcl::recording::{read_tum, write_tum};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde_json::Value;
 use tempfile::TempDir;
+
+use crate::common::{Fpmcl, Output, fpmcl, json, real_recording, run, simulate_two_drives};
 
 /// A street with a bend, scanned by 32 beams that are not evenly spaced, without times.
 const SIMULATION: &str = "\

@@ -3,8 +3,9 @@
 
 use std::fs;
 
-use crate::common::{Recording, config_file, fpmcl};
 use ::fpmcl::internals::app::LocalizationResults;
+
+use crate::common::{Recording, config_file, fpmcl};
 
 /// A recording with its map.
 fn mapped(frames: usize) -> Recording {

@@ -10,10 +10,11 @@ use std::thread;
 #[cfg(unix)]
 use std::time::{Duration, Instant};
 
+use nalgebra::{Isometry3, Matrix4, Unit, Vector3};
+
 #[cfg(unix)]
 use crate::common::replace_by_pipe;
 use crate::common::{Fpmcl, fpmcl, json, simulate_two_drives};
-use nalgebra::{Isometry3, Matrix4, Unit, Vector3};
 
 const STREET: &str = "\
 output_folder: street

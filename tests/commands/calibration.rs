@@ -4,9 +4,10 @@
 use std::fmt::Write as _;
 use std::fs;
 
-use crate::common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, run, simulate_two_drives};
 use fpmcl::internals::app::LocalizationResults;
 use nalgebra::Vector3;
+
+use crate::common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, run, simulate_two_drives};
 
 const SIMULATION: &str = "\
 output_folder: street

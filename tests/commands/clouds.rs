@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::common::{fpmcl, run};
+use crate::common::{self, fpmcl, run};
 
 /// A street of 40 m between walls: x, y, z and the normal of each point.
 fn street() -> Vec<[f32; 6]> {
@@ -31,7 +31,7 @@ fn pcd(points: &[[f32; 6]]) -> Vec<u8> {
     [header.into_bytes(), numbers.collect()].concat()
 }
 
-fn build(folder: &Path, cloud: &str, output: &str) -> crate::common::Fpmcl {
+fn build(folder: &Path, cloud: &str, output: &str) -> common::Fpmcl {
     fpmcl("build-map")
         .in_folder(folder)
         .with(cloud)

@@ -4,7 +4,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command as Process;
 
-use crate::common::skips::skipped;
 use clap::{CommandFactory as _, Parser as _};
 use fpmcl::internals::app::settings::{
     BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
@@ -12,6 +11,8 @@ use fpmcl::internals::app::settings::{
 };
 use fpmcl::internals::app::{Cli, Command, ComparisonConfig};
 use fpmcl::simulation::SimulationConfig;
+
+use crate::common::skips::skipped;
 
 /// Options of other programs: cargo, evo and Snakemake.
 const OF_OTHERS: [&str; 8] = [

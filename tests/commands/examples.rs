@@ -4,10 +4,11 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use crate::common::simulate_two_drives;
 use fpmcl::geometry::Pose3;
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::{Recording, read_tum};
+
+use crate::common::simulate_two_drives;
 
 const SIMULATION: &str = "\
 output_folder: street

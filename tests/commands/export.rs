@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use crate::common::{Fpmcl, Recording, fpmcl};
 use fpmcl::geometry::Vec3;
 use fpmcl::internals::mesh_file;
 use fpmcl::internals::scan_files;
 use fpmcl::internals::surface_area_m2;
 use serde_json::Value;
+
+use crate::common::{Fpmcl, Recording, fpmcl};
 
 const RESULT: &str = "results/localization.npz";
 const FRAMES: usize = 5;

@@ -4,13 +4,14 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 
-use crate::common::{SENSOR, fpmcl, json, run, simulate_two_drives};
 use fpmcl::geometry::{StampedPose, TriangleMesh, pose2_from_pose3};
 use fpmcl::internals::ply;
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::PoseTrack;
 use fpmcl::recording::write_tum;
 use fpmcl::rendering::Backend;
+
+use crate::common::{SENSOR, fpmcl, json, run, simulate_two_drives};
 
 const SIMULATION: &str = "\
 output_folder: street

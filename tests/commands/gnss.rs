@@ -3,10 +3,11 @@
 use std::fs;
 use std::path::Path;
 
-use crate::common::{Fpmcl, fpmcl, json, run, simulate_two_drives};
 use fpmcl::georeference::{GeodeticFix, GeodeticFixes, Wgs84};
 use fpmcl::recording::{read_fixes, read_tum};
 use serde_json::Value;
+
+use crate::common::{Fpmcl, fpmcl, json, run, simulate_two_drives};
 
 /// A street with a bend, and a receiver of 2 cm in the southern hemisphere.
 const SIMULATION: &str = "\

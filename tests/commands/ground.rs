@@ -3,10 +3,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::common::fpmcl;
 use fpmcl::recording::{read_labels, write_labels, write_scan};
 use fpmcl::simulation::{LabelledScan, ScannerConfig, slope_scene};
 use tempfile::TempDir;
+
+use crate::common::{self, fpmcl};
 
 /// A recording of two labelled scans in front of a slope.
 fn recording() -> (TempDir, Vec<LabelledScan>) {
@@ -224,7 +225,7 @@ fn scans_of_a_bag_have_the_labels_of_the_same_scans_as_files() {
         };
         assert_eq!(labels("drive_mcap"), labels("velodyne"));
     }
-    let explain = |call: crate::common::Fpmcl| {
+    let explain = |call: common::Fpmcl| {
         let call = call.set("topic", "/front").with("--explain");
         call.with("9").with("0").with("-1.7")
     };

@@ -1,12 +1,13 @@
 //! Ground segmentation against the labels of SemanticKITTI and nuScenes, where they are available.
 
-use crate::common::real_recording;
 use fpmcl::evaluation::{GroundProtocol, GroundScore};
 use fpmcl::ground::{
     FuzzyConfig, FuzzyGround, GroundClassifier, PcaGround, RansacGround, ReportRule,
 };
 use fpmcl::internals::scan_files;
 use fpmcl::recording::read_labels;
+
+use crate::common::real_recording;
 
 /// A labelled recording: its folder, the path of a scan in it, and the number of scans.
 struct Labelled {

@@ -5,7 +5,6 @@ use std::fs;
 use std::path::Path;
 use std::sync::Arc;
 
-use crate::common::{Output, fpmcl, json, run, simulate_two_drives};
 use fpmcl::geometry::Pose3;
 use fpmcl::inertial::{Imu, ImuSamples};
 use fpmcl::lidar::Scan;
@@ -15,6 +14,8 @@ use fpmcl::simulation::{
     ImuGrade, MotionConfig, ScannerConfig, SimulatedImuConfig, Simulation, SimulationConfig,
 };
 use nalgebra::Vector3;
+
+use crate::common::{Output, fpmcl, json, run, simulate_two_drives};
 
 /// Two bends uphill, with the sensor of a car whose clock is 50 ms ahead.
 const SIMULATION: &str = "\

@@ -7,9 +7,10 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use crate::common::{COMPARISON_OF_STREET, Fpmcl, Recording, fpmcl};
 use fpmcl::internals::app::schemas;
 use serde_json::Value;
+
+use crate::common::{COMPARISON_OF_STREET, Fpmcl, Recording, fpmcl};
 
 /// The line of the page below which all of it is generated.
 const GENERATED: &str =

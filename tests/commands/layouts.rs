@@ -6,13 +6,14 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::common::fpmcl;
 use fpmcl::geometry::Pose3;
 use fpmcl::memory::MemoryBudget;
 use fpmcl::recording::{Recording, RecordingError, Selection};
 use nalgebra::{Matrix4, Translation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 use tempfile::TempDir;
+
+use crate::common::{self, fpmcl};
 
 const SCANS: usize = 4;
 
@@ -964,8 +965,8 @@ fn numbers(value: &Value) -> Vec<f64> {
 fn every_layout_is_read_as_kiss_icp_reads_it() {
     for set in data_sets() {
         let Some(kiss) = &set.kiss else { continue };
-        let Some(python) = crate::common::python_with(kiss.modules, "kiss_icp") else {
-            crate::common::skips::skipped(format!("{}: no Python has {}", set.name, kiss.modules));
+        let Some(python) = common::python_with(kiss.modules, "kiss_icp") else {
+            common::skips::skipped(format!("{}: no Python has {}", set.name, kiss.modules));
             continue;
         };
         let folder = set.folder.path().join(kiss.path.unwrap_or(set.path));
@@ -991,8 +992,8 @@ fn run_python(python: &Path, script: &str, arguments: &[&str]) -> String {
 #[test]
 fn bags_are_read_as_kiss_icp_reads_them() {
     let modules = "kiss_icp, rosbags";
-    let Some(python) = crate::common::python_with(modules, "kiss_icp") else {
-        crate::common::skips::skipped(format!("bags: no Python has {modules}"));
+    let Some(python) = common::python_with(modules, "kiss_icp") else {
+        common::skips::skipped(format!("bags: no Python has {modules}"));
         return;
     };
     let folder = tempfile::tempdir().unwrap();

@@ -5,8 +5,9 @@ use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::Path;
 
-use crate::common::{Recording, fpmcl, json, run};
 use zip::write::SimpleFileOptions;
+
+use crate::common::{self, Recording, fpmcl, json, run};
 
 /// A budget that no stage fits in [GiB].
 const TINY: &str = "--memory=0.01";
@@ -283,7 +284,7 @@ fn the_odometry_of_scans_that_all_see_the_same_is_within_the_budget() {
 #[test]
 fn the_batches_of_a_graphics_device_are_within_the_budget() {
     if run(Path::new("."), &["doctor", "--measure=0"]).contains("adapter           none") {
-        crate::common::skips::skipped("there is no graphics adapter");
+        common::skips::skipped("there is no graphics adapter");
         return;
     }
     let recording = Recording::street(2);

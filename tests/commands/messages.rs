@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::common::{Recording, fpmcl, real_recording};
+use crate::common::{self, Recording, fpmcl, real_recording};
 
 #[test]
 fn without_an_input_the_message_asks_for_one_and_names_no_path_as_given() {
@@ -39,10 +39,7 @@ fn a_build_speaks_of_no_request_and_of_no_missing_file_that_nobody_needs() {
             .set("depth", "6")
             .set("voxel_size", "0.2")
             .set("holdout_step", "3");
-        let output = arguments
-            .iter()
-            .fold(call, crate::common::Fpmcl::with)
-            .succeeds();
+        let output = arguments.iter().fold(call, common::Fpmcl::with).succeeds();
         for part in ["was requested", "give their file", "has no poses"] {
             let texts = [&output.stdout, &output.stderr];
             assert!(!texts.iter().any(|text| text.contains(part)), "{texts:?}");

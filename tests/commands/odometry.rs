@@ -3,7 +3,6 @@
 use std::fs;
 use std::path::Path;
 
-use crate::common::{fpmcl, json, real_recording, run, simulate_two_drives};
 use fpmcl::geometry::Pose3;
 use fpmcl::internals::MappedPly;
 use fpmcl::internals::ply;
@@ -12,6 +11,8 @@ use fpmcl::mapping::map_recording;
 use fpmcl::recording::{PoseTrack, Recording, read_tum};
 use fpmcl::rendering::Backend;
 use glam::DVec3;
+
+use crate::common::{fpmcl, json, real_recording, run, simulate_two_drives};
 
 /// A street with a bend and traffic.
 const SIMULATION: &str = "\

@@ -4,10 +4,6 @@
 use std::fs;
 use std::path::Path;
 
-use crate::common::picture::Picture;
-use crate::common::{
-    DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, Recording, SENSOR, json, run, simulate_two_drives,
-};
 use fpmcl::internals::CameraPoses;
 use fpmcl::internals::app::LocalizationResults;
 use fpmcl::internals::app::color::{MCL, REFINED, TRUTH};
@@ -15,6 +11,11 @@ use fpmcl::recording::Calibration;
 use fpmcl::recording::read_tum;
 use serde_json::Value;
 use tempfile::TempDir;
+
+use crate::common::picture::Picture;
+use crate::common::{
+    DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, Recording, SENSOR, json, run, simulate_two_drives,
+};
 
 /// Frames of each of the two drives.
 const FRAMES: usize = 16;

@@ -5,11 +5,12 @@
 use std::fs;
 use std::path::Path;
 
-use crate::bag_writers::{Cloud, Kind, Recorded, mcap, point_cloud2};
 use fpmcl::geometry::Vec3;
 use fpmcl::internals::scan_files;
 use fpmcl::lidar::Scan;
 use fpmcl::recording::{Bag, PoseTrack, Recording};
+
+use crate::bag_writers::{Cloud, Kind, Recorded, mcap, point_cloud2};
 
 const START_NS: u64 = 1_700_000_000_250_000_000;
 

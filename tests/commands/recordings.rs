@@ -2,8 +2,9 @@
 
 use std::fs;
 
-use crate::common::{Recording, fpmcl};
 use fpmcl::internals::app::LocalizationResults;
+
+use crate::common::{self, Recording, fpmcl};
 
 const FRAMES: usize = 6;
 
@@ -269,7 +270,7 @@ fn times_of_exactly_ten_scans_per_second_are_matched_where_they_were_recorded() 
         call.with(truth)
     };
     let rmse_m = || {
-        let errors = crate::common::json(&recording.path("results/report.json"));
+        let errors = common::json(&recording.path("results/report.json"));
         errors["mcl"]["metrics"]["position_m"]["rmse"]
             .as_f64()
             .unwrap()

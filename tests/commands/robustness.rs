@@ -5,14 +5,15 @@ use std::fs;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use crate::common::{
-    DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, numbers, run, simulate_two_drives,
-};
 use fpmcl::internals::app::LocalizationResults;
 use fpmcl::internals::ply;
 use fpmcl::localization::State;
 use fpmcl::recording::read_tum;
 use tempfile::TempDir;
+
+use crate::common::{
+    self, DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, numbers, run, simulate_two_drives,
+};
 
 /// Frames of a drive; 0.8 m apart.
 const FRAMES: usize = 40;
@@ -219,7 +220,7 @@ fn the_graphics_card_finds_the_same_path() {
         (text.lines()).any(|line| line.starts_with("adapter ") && !line.contains("none"));
     let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");
     if !has_adapter && !required {
-        crate::common::skips::skipped("there is no graphics adapter");
+        common::skips::skipped("there is no graphics adapter");
         return;
     }
     let outcome = localize("gpu", &["--backend=gpu"]);

@@ -1,9 +1,10 @@
 //! Seams between local maps: the road has no gap and no second layer there.
 
-use crate::common::Recording;
 use fpmcl::internals::Scene;
 use fpmcl::internals::ply;
 use glam::Vec3;
+
+use crate::common::Recording;
 
 /// Height of the road in the frame of the first scan [m].
 const ROAD_M: f32 = -1.73;

@@ -1,7 +1,6 @@
 //! Scans of other sensors, as their drivers write them: every point is read, and the sensor is recognized.
 
 use std::fs;
-
 use std::path::Path;
 
 use fpmcl::internals::estimate_spatial_normals;
@@ -9,13 +8,15 @@ use fpmcl::internals::scan_files;
 use fpmcl::lidar::{NormalConfig, RangeImage, Scan};
 use fpmcl::sensor::{BeamSource, DroppedPoints, Sensor, SensorConfig};
 
+use crate::common;
+
 fn infer(scans: &[Scan]) -> Sensor {
     Sensor::infer(scans, &SensorConfig::default()).unwrap()
 }
 
 #[test]
 fn every_sample_has_the_points_of_its_header_and_they_surround_the_sensor() {
-    let Some(folder) = crate::common::real_recording("sensor-samples") else {
+    let Some(folder) = common::real_recording("sensor-samples") else {
         return;
     };
     for entry in fs::read_dir(folder).unwrap() {
@@ -39,7 +40,7 @@ fn every_sample_has_the_points_of_its_header_and_they_surround_the_sensor() {
 
 #[test]
 fn scans_of_nuscenes_have_five_numbers_per_point() {
-    let Some(folder) = crate::common::real_recording("nuscenes-hdl32") else {
+    let Some(folder) = common::real_recording("nuscenes-hdl32") else {
         return;
     };
     for entry in fs::read_dir(folder.join("lidar")).unwrap() {
@@ -65,7 +66,7 @@ fn sensor_of(folder: &Path, step: usize, count: usize) -> (Vec<Scan>, Sensor) {
 
 #[test]
 fn the_beams_of_twelve_sensors_are_counted_from_one_scan() {
-    let Some(folder) = crate::common::real_recording("sensor-samples") else {
+    let Some(folder) = common::real_recording("sensor-samples") else {
         return;
     };
     for (name, beams) in [
@@ -91,7 +92,7 @@ fn the_beams_of_twelve_sensors_are_counted_from_one_scan() {
 
 #[test]
 fn channels_are_rings_and_times_within_packets_are_none_of_the_sweep() {
-    let Some(folder) = crate::common::real_recording("sensor-samples") else {
+    let Some(folder) = common::real_recording("sensor-samples") else {
         return;
     };
     let read = scan_files::read_stamped(&folder.join("vlp16.pcd"), None).unwrap();
@@ -104,7 +105,7 @@ fn channels_are_rings_and_times_within_packets_are_none_of_the_sweep() {
 
 #[test]
 fn the_sensor_of_kitti_is_recognized_by_a_drive() {
-    let Some(folder) = crate::common::real_recording("kitti-0926-drive-0005") else {
+    let Some(folder) = common::real_recording("kitti-0926-drive-0005") else {
         return;
     };
     let (scans, sensor) = sensor_of(&folder.join("velodyne"), 8, 10);
@@ -132,7 +133,7 @@ fn the_beams_of_kitti_are_64_in_compensated_scans_of_its_benchmark() {
         "semantickitti-00-labels",
         "semantickitti-08-labels",
     ] {
-        let Some(folder) = crate::common::real_recording(recording) else {
+        let Some(folder) = common::real_recording(recording) else {
             continue;
         };
         let (_, sensor) = sensor_of(&folder.join("velodyne"), 1, 10);
@@ -146,7 +147,7 @@ fn the_beams_of_kitti_are_64_in_compensated_scans_of_its_benchmark() {
 
 #[test]
 fn the_sensor_of_nuscenes_is_recognized_by_a_drive() {
-    let Some(folder) = crate::common::real_recording("nuscenes-hdl32") else {
+    let Some(folder) = common::real_recording("nuscenes-hdl32") else {
         return;
     };
     let (_, sensor) = sensor_of(&folder.join("lidar"), 3, 10);
@@ -168,7 +169,7 @@ fn the_sensor_of_nuscenes_is_recognized_by_a_drive() {
 
 #[test]
 fn a_livox_has_no_rows_and_normals_from_neighbours_in_space() {
-    let Some(folder) = crate::common::real_recording("livox-hku2") else {
+    let Some(folder) = common::real_recording("livox-hku2") else {
         return;
     };
     let (scans, sensor) = sensor_of(&folder.join("scans"), 13, 20);

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::common::{Fpmcl, Recording, config_file, fpmcl, json};
+use crate::common::{self, Fpmcl, Recording, config_file, fpmcl, json};
 
 /// The poses of `Recording::street`, `(right, ahead)` of each frame [m].
 fn poses(positions_m: &[(f64, f64)]) -> String {
@@ -155,7 +155,7 @@ fn frames_that_are_lost_are_no_part_of_the_trajectory_its_length_and_its_picture
     ] {
         plain(command).exits_with(0);
         let table = String::from_utf8(recording.bytes("results/frames.csv")).unwrap();
-        let states = crate::common::column(&recording.path("results/frames.csv"), column);
+        let states = common::column(&recording.path("results/frames.csv"), column);
         let tracked = states.iter().filter(|state| *state == "tracking").count();
         assert!((6..12).contains(&tracked), "{states:?}");
         // What is not known has an empty cell.

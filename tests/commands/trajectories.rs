@@ -14,7 +14,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::bag_writers::{Cloud, Kind, Recorded, mcap, odometry, point_cloud2, transforms};
-use crate::common::{Fpmcl, fpmcl, json, real_recording};
+use crate::common::{self, Fpmcl, fpmcl, json, real_recording};
 
 /// The pose after `time_s` at 10 m/s along a circle that rises, of a lidar with x ahead.
 fn truth_at(time_s: f64) -> Pose3 {
@@ -84,8 +84,8 @@ fn number(errors: &Value, path: &[&str]) -> f64 {
 
 #[test]
 fn errors_of_all_alignments_and_segments_equal_those_of_evo() {
-    let Some(python) = crate::common::python_with("evo.core.metrics", "python") else {
-        crate::common::skips::skipped("FPMCL_PYTHON names no interpreter with evo");
+    let Some(python) = common::python_with("evo.core.metrics", "python") else {
+        common::skips::skipped("FPMCL_PYTHON names no interpreter with evo");
         return;
     };
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
