@@ -14,9 +14,9 @@
 //! than [`MOST_CELLS`], c is doubled until they do not, and all of the lengths above with it. Triangles longer than
 //! 500 m are clipped to the bounds of the others; those around them are compared with each other, in a second grid.
 
-use std::collections::HashMap;
 use std::ops::Range;
 
+use foldhash::{HashMap, HashMapExt as _};
 use glam::{DVec3, Vec3};
 use nalgebra::Point2;
 
@@ -270,23 +270,26 @@ impl GroundSurface {
         }
         // A cell may have as many surfaces as the mesh has triangles: they are sorted and searched by bisection.
         let mut sorted = components.to_vec();
-        let mut lowest_large: HashMap<(i32, i32), Vec<usize>> = HashMap::new();
+        // Per cell, where its surfaces begin: the lowest surface of a large component, and the lowest of another one.
+        let mut lowest_large: Vec<[Option<u32>; 2]> = vec![[None; 2]; components.len()];
         for of_cell in self.surfaces.chunk_by(|a, b| a.cell() == b.cell()) {
             let all = self.in_cell(of_cell[0].cell());
+            let lowest = &mut lowest_large[all.start];
             sorted[all.clone()].sort_unstable();
-            // The lowest surface of a large component, and the lowest of another one.
-            let mut lowest: Vec<usize> = vec![];
             for index in all {
                 let component = components[index];
-                let is_other = |&it: &usize| components[it] != component;
-                if cells[component as usize] >= MIN_CELLS && lowest.iter().all(is_other) {
-                    lowest.push(index);
+                if cells[component as usize] < MIN_CELLS {
+                    continue;
                 }
-                if lowest.len() == 2 {
-                    break;
+                match lowest {
+                    [None, _] => lowest[0] = Some(index as u32),
+                    [Some(first), _] if components[*first as usize] == component => {}
+                    _ => {
+                        lowest[1] = Some(index as u32);
+                        break;
+                    }
                 }
             }
-            lowest_large.insert(of_cell[0].cell(), lowest);
         }
         for (index, surface) in self.surfaces.iter().enumerate() {
             let own = components[index];
@@ -299,9 +302,15 @@ impl GroundSurface {
                 continue;
             }
             let has_below = |offset| {
-                let lowest = lowest_large.get(&neighbour(offset)).into_iter().flatten();
-                let mut others = lowest.filter(|&&other| components[other] != own);
-                others.any(|&other| self.surfaces[other].high_m < surface.low_m - below_m)
+                let cell = self.in_cell(neighbour(offset));
+                let lowest = lowest_large.get(cell.start).filter(|_| !cell.is_empty());
+                let mut others = (lowest
+                    .into_iter()
+                    .flatten()
+                    .flatten()
+                    .map(|&it| it as usize))
+                .filter(|&other| components[other] != own);
+                others.any(|other| self.surfaces[other].high_m < surface.low_m - below_m)
             };
             rim[own as usize] += 1;
             above[own as usize] += u32::from(cells_within(RIM_CELLS).any(has_below));
