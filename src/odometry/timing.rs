@@ -23,7 +23,8 @@ use crate::validation::{InvalidValue, Validate as _};
 #[derive(Clone, Debug, PartialEq)]
 pub struct TimingComparison {
     /// The candidates, `None` for points without times, then the order of the points, or clockwise and
-    /// counter-clockwise with the start of the revolution that fits each best, with the mean residual of the odometry [m].
+    /// counter-clockwise with the start of the revolution that fits each best, with the mean residual of the odometry [m]. Where a
+    /// timing was expected and fits, it is the first, and those with which it was compared follow.
     pub residuals_m: Vec<(Option<PointTiming>, f64)>,
     /// Index of the candidate that fits; `None` if the residuals do not decide, as without motion.
     pub best: Option<usize>,
@@ -69,31 +70,43 @@ pub fn compare_timings(
         RotationDirection::Clockwise,
         RotationDirection::CounterClockwise,
     ];
-    let fitted = |direction: &RotationDirection| {
+    let coarse = |direction: &RotationDirection| {
         let first = first(*direction);
-        let coarse = runs.best_quarter(first)?;
-        // The first start fits: there is nothing to refine. Nor where the best of four is clearly worse than no times: a start
-        // that is off by an eighth of a turn has wrong times for an eighth of the points.
-        let is_done = coarse.0 == first || coarse.1 > (1.0 + SPREAD) * runs.none_m;
+        Ok((first, runs.best_quarter(first)?))
+    };
+    let coarse: Result<Vec<(Rotation, Fitted)>, TimingError> =
+        directions.par_iter().map(coarse).collect();
+    let coarse = coarse?;
+    let is_worse = |residual_m: f64, other_m: f64| residual_m > (1.0 + SPREAD) * other_m;
+    // A first start of one direction with which the scans fit clearly better than without times.
+    let of_first = (coarse.iter())
+        .filter(|(first, found)| found.0 == *first && is_worse(runs.none_m, found.1));
+    let fitting_m = of_first.fold(f64::INFINITY, |least_m, (_, found)| least_m.min(found.1));
+    let fitted = |&(first, found): &(Rotation, Fitted)| {
+        // The first start fits: there is nothing to refine. Nor where the best of four is clearly worse than no times, or than
+        // the first start of the other direction: a start that is off by an eighth of a turn has wrong times for an eighth of
+        // the points.
+        let is_done =
+            found.0 == first || is_worse(found.1, runs.none_m) || is_worse(found.1, fitting_m);
         let (rotation, residual_m) = if is_done {
-            coarse
+            found
         } else {
-            runs.best_start(coarse)?
+            runs.best_start(found)?
         };
         Ok((Some(PointTiming::Rotation(rotation)), residual_m))
     };
-    let rotations: Result<Vec<_>, TimingError> = directions.par_iter().map(fitted).collect();
+    let rotations: Result<Vec<_>, TimingError> = coarse.par_iter().map(fitted).collect();
     let residuals_m = [none].into_iter().chain(rotations?);
     Ok(TimingComparison::decided(residuals_m.collect()))
 }
 
-/// Whether a configured timing has clearly the smallest residual, so that the full comparison is not needed: smaller than no
-/// times and, of a rotation, the opposite direction and the other starts by quarters of a turn.
+/// The comparison of a timing that is expected with no times and, of a rotation, the opposite direction and the other starts by
+/// quarters of a turn; `None` if it does not fit clearly best, so that the full comparison is needed.
 pub fn fits_best(
     timing: PointTiming,
     scans: &[Scan],
     config: &OdometryConfig,
-) -> Result<bool, TimingError> {
+) -> Result<Option<TimingComparison>, TimingError> {
     let timings = match timing {
         PointTiming::Order { .. } => vec![timing],
         PointTiming::Rotation(rotation) => {
@@ -104,7 +117,8 @@ pub fn fits_best(
     let runs = Runs::new(scans, config)?;
     let timed: Result<Vec<_>, TimingError> = timings.par_iter().map(|it| runs.with(*it)).collect();
     let residuals_m = timed?.into_iter().chain([(None, runs.none_m)]);
-    Ok(TimingComparison::decided(residuals_m.collect()).best == Some(0))
+    let compared = TimingComparison::decided(residuals_m.collect());
+    Ok(Some(compared).filter(|compared| compared.best == Some(0)))
 }
 
 /// A rotation, and the others that start quarters of a turn from it.

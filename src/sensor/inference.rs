@@ -84,6 +84,19 @@ impl Sensor {
         recording: &Recording,
         known: &SensorConfig,
     ) -> Result<Self, SensorError> {
+        Self::infer_expected(recording, known, None)
+    }
+
+    /// As [`infer_recording`](Self::infer_recording), where the recording is expected to be of a sensor, such as that of the map: its
+    /// rotation is taken if it fits clearly best, without a comparison with all others.
+    ///
+    /// # Errors
+    /// As [`infer_recording`](Self::infer_recording).
+    pub fn infer_expected(
+        recording: &Recording,
+        known: &SensorConfig,
+        expected: Option<&Self>,
+    ) -> Result<Self, SensorError> {
         let is_auto = known.motion_compensation == Some(MotionCompensation::Auto);
         if let (Some(configured), false) = (known.motion_compensation, is_auto) {
             warn_of_contradiction(recording, configured)?;
@@ -100,7 +113,7 @@ impl Sensor {
         sensor.warn_of_dropped_points(&scans);
         if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
             sensor.motion_compensation =
-                sensor.timing(&scans, || timings_of_recording(recording))?;
+                sensor.timing(&scans, || timings_of_recording(recording, expected))?;
         }
         Ok(sensor)
     }
@@ -324,7 +337,7 @@ fn warn_of_contradiction(
     let period_s = period_s(recording).unwrap_or(PERIOD_S);
     let (configured, config) = (configured.timing(period_s), OdometryConfig::default());
     if let Some(timing) = configured
-        && fits_best(timing, &scans, &config)?
+        && fits_best(timing, &scans, &config)?.is_some()
     {
         return Ok(());
     }
@@ -369,10 +382,22 @@ fn residuals_in_words(compared: &TimingComparison) -> String {
     words.join(", ")
 }
 
-/// Compares the times of points by the distances between successive scans nearest the middle of a recording.
-fn timings_of_recording(recording: &Recording) -> Result<Option<TimingComparison>, SensorError> {
+/// Compares the times of points by the distances between successive scans nearest the middle of a recording, first with the
+/// rotation of an expected sensor.
+fn timings_of_recording(
+    recording: &Recording,
+    expected: Option<&Sensor>,
+) -> Result<Option<TimingComparison>, SensorError> {
     let scans = timing_scans(recording)?;
-    timings_of(&scans, period_s(recording).unwrap_or(PERIOD_S))
+    let period_s = period_s(recording).unwrap_or(PERIOD_S);
+    let expected = expected.and_then(|it| it.motion_compensation?.timing(period_s));
+    if let Some(rotation @ PointTiming::Rotation(_)) = expected
+        && show_times(&scans)
+        && let Some(compared) = fits_best(rotation, &scans, &OdometryConfig::default())?
+    {
+        return Ok(Some(compared));
+    }
+    timings_of(&scans, period_s)
 }
 
 /// The successive scans nearest the middle of a recording; none if all are far apart.

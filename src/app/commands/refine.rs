@@ -108,7 +108,10 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     run_output::warn_of_shortfall(&results, &config.result_file);
     let map = config.map_input.load(MapOptions::default(), context)?;
     let mut resolved = config.clone();
-    let (sequence, sensor) = inputs.open_in_map(&map, &mut resolved.sensor)?;
+    let localization = (!is_trajectory).then(|| base_config(Some(&config.result_file)));
+    let found = localization.filter(|localization| localization.recording == config.recording);
+    let found = found.map(|localization| localization.sensor);
+    let (sequence, sensor) = inputs.open_in_map(&map, &mut resolved.sensor, found.as_ref())?;
     let odometry = OdometryConfig::default();
     let sequence = (config.inertial).open_calibrated(sequence, &odometry, context)?;
     let config = &resolved;

@@ -18,7 +18,7 @@ use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::mapping::calibrated;
 use crate::odometry::{GnssConstraints, OdometryConfig};
 use crate::recording::{PoseTrack, Recording, RecordingError, is_topic};
-use crate::sensor::{Sensor, SensorConfig};
+use crate::sensor::{MotionCompensation, Sensor, SensorConfig};
 
 /// Values of keys, as those of `--set`.
 pub fn settings_of(keys: &[(&str, Value)]) -> Vec<(String, String)> {
@@ -75,14 +75,26 @@ impl<'a> RecordingInputs<'a> {
     }
 
     /// Opens the selected frames, with the true poses in the frame of a map, and completes what is known about the sensor
-    /// by what the scans show.
-    pub fn open_in_map(&self, map: &Map, known: &mut SensorConfig) -> Result<(Recording, Sensor)> {
+    /// by what the scans show, unless all of it is `found`: what the same scans have shown before.
+    pub fn open_in_map(
+        &self,
+        map: &Map,
+        known: &mut SensorConfig,
+        found: Option<&SensorConfig>,
+    ) -> Result<(Recording, Sensor)> {
         let mut recording = self.open()?;
         if let Some(pose_file) = &self.poses.pose_file {
             let track = self.track(pose_file, &recording)?;
             recording = recording.with_truth(track.in_map(&map.path.world_from_map))?;
         }
-        infer(known, recording)
+        let is_complete = known.motion_compensation != Some(MotionCompensation::Auto);
+        let found = found.filter(|found| is_complete && *found == known);
+        let sensor = match found.and_then(Sensor::configured) {
+            Some(sensor) => sensor,
+            None => Sensor::infer_expected(&recording, known, map.path.sensor.as_ref())?,
+        };
+        *known = SensorConfig::from(&sensor);
+        Ok((sensor.applied_to(recording), sensor))
     }
 
     /// Reads poses of the recording from a file, or from a topic of its bag.

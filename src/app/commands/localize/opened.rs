@@ -62,7 +62,7 @@ pub fn open(
     let claims = prepare(config, read, further_files, &files)?;
     let map = config.map_input.load(config.map_options(), context)?;
     let mut resolved = config.clone();
-    let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
+    let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor, None)?;
     gnss_start::resolve(&mut resolved, &map, &recording)?;
     let first = recording.frames.first();
     let is_at_truth =
