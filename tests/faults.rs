@@ -22,7 +22,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use common::skips::skipped;
-use common::{COMPARISON_OF_STREET, Recording};
+use common::{COMPARISON_OF_STREET, Recording, copy_into};
 use fpmcl::internals::app::LocalizationResults;
 use rand::RngExt as _;
 
@@ -373,19 +373,6 @@ impl Copy {
 
     fn path(&self) -> PathBuf {
         self.0.path().join("drive")
-    }
-}
-
-fn copy_into(from: &Path, to: &Path) {
-    fs::create_dir_all(to).unwrap();
-    for entry in fs::read_dir(from).unwrap() {
-        let path = entry.unwrap().path();
-        let target = to.join(path.file_name().unwrap());
-        if path.is_dir() {
-            copy_into(&path, &target);
-        } else {
-            fs::copy(&path, &target).unwrap();
-        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::Path;
+use std::sync::LazyLock;
 
 use fpmcl::geometry::{Pose3, StampedPose};
 use fpmcl::internals::app::LocalizationResults;
@@ -12,7 +13,9 @@ use nalgebra::{UnitQuaternion, Vector3};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::common::{Fpmcl, Output, fpmcl, json, real_recording, run, simulate_two_drives};
+use crate::common::{
+    Fpmcl, Output, copy_into, fpmcl, json, real_recording, run, shared_folder, simulate_two_drives,
+};
 
 /// A street with a bend, scanned by 32 beams that are not evenly spaced, without times.
 const SIMULATION: &str = "\
@@ -35,12 +38,19 @@ fn truth(folder: &Path) -> Vec<Pose3> {
     track("drive_2").in_map(&map).map_from_lidar
 }
 
-/// A folder with two simulated drives and a map of the first, and the true poses of the second in it.
-fn with_first_drive_mapped() -> (TempDir, Vec<Pose3>) {
-    let folder = tempfile::tempdir().unwrap();
+/// Two simulated drives and a map of the first.
+static FIRST_DRIVE_MAPPED: LazyLock<TempDir> = LazyLock::new(|| {
+    let folder = shared_folder();
     simulate_two_drives(folder.path(), SIMULATION);
     let build = ["build-map", "street/drive_1", "--output", "map.ply"];
     run(folder.path(), &build);
+    folder
+});
+
+/// A folder with two simulated drives and a map of the first, and the true poses of the second in it.
+fn with_first_drive_mapped() -> (TempDir, Vec<Pose3>) {
+    let folder = tempfile::tempdir().unwrap();
+    copy_into(FIRST_DRIVE_MAPPED.path(), folder.path());
     let truth = truth(folder.path());
     (folder, truth)
 }
@@ -68,18 +78,12 @@ fn localize(folder: &Path, drive: &str, result: &str) -> Fpmcl {
 
 #[test]
 fn two_folders_are_enough_for_a_map_and_a_trajectory_in_it() {
-    let folder = tempfile::tempdir().unwrap();
+    let (folder, _truth) = with_first_drive_mapped();
     let folder = folder.path();
-    simulate_two_drives(folder, SIMULATION);
     let described = run(folder, &["info", "street/drive_1"]);
     for part in ["KITTI odometry", "32 beams", "build-map", "ready"] {
         assert!(described.contains(part), "{described}");
     }
-    let build = ["build-map", "street/drive_1", "--output", "map.ply"];
-    run(
-        folder,
-        &[&build[..], &["--set", "visualize=False"]].concat(),
-    );
     let sensor = json(&folder.join("map.report.json"))["sensor"].clone();
     assert_eq!(sensor["beams"], 32);
     let height_m = sensor["mounting"]["height_m"].as_f64().unwrap();

@@ -5,23 +5,43 @@ use std::fs;
 use std::path::Path;
 #[cfg(unix)]
 use std::process::{Child, Command, Stdio};
+use std::sync::LazyLock;
 #[cfg(unix)]
 use std::thread;
 #[cfg(unix)]
 use std::time::{Duration, Instant};
 
 use nalgebra::{Isometry3, Matrix4, Unit, Vector3};
+use tempfile::TempDir;
 
 #[cfg(unix)]
 use crate::common::replace_by_pipe;
-use crate::common::{Fpmcl, fpmcl, json, simulate_two_drives};
+use crate::common::{Fpmcl, copy_into, fpmcl, json, shared_folder, simulate_two_drives};
 
+/// A bend: a straight path determines no rotation about itself.
 const STREET: &str = "\
 output_folder: street
 seed: 5
 n_scans: 30
+path: [{length_m: 45, turn_deg: 60, grade_percent: 3}]
 scanner: {beams: 32, azimuth_steps: 720}
 ";
+
+/// Two drives and their finished benchmark, of which other tests take the stages of the first drive.
+static FINISHED: LazyLock<TempDir> = LazyLock::new(|| {
+    let folder = shared_folder();
+    simulate_two_drives(folder.path(), STREET);
+    let printed = benchmark(folder.path()).succeeds().stdout;
+    assert!(printed.contains("benchmark.html"), "{printed}");
+    folder
+});
+
+/// A copy of [`FINISHED`].
+fn finished() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    copy_into(FINISHED.path(), folder.path());
+    folder
+}
 
 fn benchmark(folder: &Path) -> Fpmcl {
     let call = fpmcl("benchmark").in_folder(folder);
@@ -31,11 +51,8 @@ fn benchmark(folder: &Path) -> Fpmcl {
 
 #[test]
 fn two_sessions_give_all_figures_and_a_second_run_takes_what_is_finished() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = finished();
     let folder = folder.path();
-    simulate_two_drives(folder, STREET);
-    let printed = benchmark(folder).succeeds().stdout;
-    assert!(printed.contains("benchmark.html"), "{printed}");
     let path = folder.join("results/benchmark/benchmark.json");
     let report = json(&path);
     let number = |pointer: &str| {
@@ -114,11 +131,8 @@ fn one_session_without_a_truth_is_divided_and_says_that_it_has_no_errors() {
 
 #[test]
 fn a_truth_of_the_second_session_in_another_frame_is_compared_after_alignment() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = finished();
     let folder = folder.path();
-    // Around a bend: a straight path determines no rotation about itself.
-    let bend = "path: [{length_m: 45, turn_deg: 60, grade_percent: 3}]";
-    simulate_two_drives(folder, &format!("{STREET}{bend}\n"));
     // A turn about an inclined axis, and a shift of 50 m.
     let axis = Unit::new_normalize(Vector3::new(0.1, -1.0, 0.2));
     let other_from_world = Isometry3::new([30.0, 4.0, -40.0].into(), axis.into_inner() * 0.8);
@@ -153,9 +167,8 @@ fn a_truth_of_the_second_session_in_another_frame_is_compared_after_alignment() 
 
 #[test]
 fn a_truth_on_a_straight_line_leaves_out_the_errors_after_alignment() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = finished();
     let folder = folder.path();
-    simulate_two_drives(folder, STREET);
     let poses = folder.join("street/drive_2/poses.txt");
     let count = fs::read_to_string(&poses).unwrap().lines().count();
     let row = |ahead_m: usize| format!("1 0 0 0 0 1 0 0 0 0 1 {ahead_m}\n");
@@ -193,10 +206,8 @@ fn another_error_of_the_evaluation_after_alignment_leaves_the_stage_unfinished()
 
 #[test]
 fn scans_and_truths_that_have_changed_are_measured_again() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = finished();
     let folder = folder.path();
-    simulate_two_drives(folder, STREET);
-    benchmark(folder).succeeds();
     let path = folder.join("results/benchmark/benchmark.json");
     let seconds = |stage: &str| json(&path)["stage_seconds"][stage].clone();
     let stages = ["1 odometry", "2 map", "3 localization"];

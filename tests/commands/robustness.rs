@@ -12,7 +12,8 @@ use fpmcl::recording::read_tum;
 use tempfile::TempDir;
 
 use crate::common::{
-    self, DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, numbers, run, simulate_two_drives,
+    self, DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, numbers, run, shared_folder,
+    simulate_two_drives,
 };
 
 /// Frames of a drive; 0.8 m apart.
@@ -29,7 +30,7 @@ scanner: {azimuth_steps: 600}
 
 /// A folder with a map of drive 1 and the scans of drive 2.
 static WORLD: LazyLock<TempDir> = LazyLock::new(|| {
-    let temporary = tempfile::tempdir().unwrap();
+    let temporary = shared_folder();
     let folder = temporary.path();
     simulate_two_drives(folder, SIMULATION);
     let map = format!("{MAP_OF_DRIVE_1}{SENSOR}depth: 8\nvisualize: False\n");

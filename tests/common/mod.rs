@@ -9,6 +9,7 @@ pub mod skips;
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -147,6 +148,36 @@ pub fn simulate_two_drives(folder: &Path, config: &str) {
     fs::write(folder.join("simulation.yml"), config).unwrap();
     for drive in ["drive=1", "drive=2"] {
         run(folder, &["simulate", "simulation.yml", "--set", drive]);
+    }
+}
+
+/// A folder for several tests, in the build folder: nothing removes it when the program ends. Those that are a day old are removed.
+pub fn shared_folder() -> TempDir {
+    const DAY: Duration = Duration::from_secs(86_400);
+    let parent = Path::new(env!("CARGO_TARGET_TMPDIR")).join("shared");
+    fs::create_dir_all(&parent).unwrap();
+    for entry in fs::read_dir(&parent).unwrap().flatten() {
+        let age = entry
+            .metadata()
+            .and_then(|it| it.modified()?.elapsed().map_err(io::Error::other));
+        if age.is_ok_and(|age| age > DAY) {
+            let _removed = fs::remove_dir_all(entry.path());
+        }
+    }
+    tempfile::tempdir_in(parent).unwrap()
+}
+
+/// Copies all files below a folder.
+pub fn copy_into(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let path = entry.unwrap().path();
+        let target = to.join(path.file_name().unwrap());
+        if path.is_dir() {
+            copy_into(&path, &target);
+        } else {
+            fs::copy(&path, &target).unwrap();
+        }
     }
 }
 
