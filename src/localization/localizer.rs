@@ -252,7 +252,11 @@ impl Localizer {
         }
         let particles = ParticleSet::uniform(particles);
         let (config, map) = (self.config.clone(), self.map.clone());
-        Ok(ParticleFilter::new(config, map, Some(request), particles)?)
+        let filter = ParticleFilter::new(config, map, Some(request), particles)?;
+        Ok(match self.start {
+            Start::Pose { .. } => filter,
+            Start::Road | Start::Anywhere => filter.searching_anywhere(),
+        })
     }
 
     /// The panoramas for a start without a pose and for a restart after a loss.

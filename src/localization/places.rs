@@ -38,7 +38,7 @@ pub struct PlacesConfig {
     /// Scale s: a mean cost that is larger by s beyond that is e times less likely [m].
     #[default(0.005)]
     pub scale_m: f64,
-    /// Largest standard deviation of the position around a start that is one place: √(σ_x² + σ_y²) [m].
+    /// Largest standard deviation of the position around a given start that is one place: √(σ_x² + σ_y²) [m].
     #[default(10.0)]
     pub known_start_m: f64,
     /// Weight from which on a place is counted as likely, 0 to 1.

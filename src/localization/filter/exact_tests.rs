@@ -571,6 +571,54 @@ fn places_are_compared_while_the_car_may_be_in_several() {
     assert_eq!(found(Search::Around, 30.0, true), (false, 1));
     assert_eq!(found(places, 0.01, true), (false, 1));
     assert_eq!(found(places, 30.0, false), (false, 1));
+    let near = [-3.0, 3.0].map(|side| start * Pose2::translation(side, 0.0));
+    let world = TestWorld::street();
+    let filter = |is_anywhere: bool| {
+        let (config, particles) = (LocalizerConfig::of_test(6), ParticleSet::uniform(near));
+        let filter = ParticleFilter::new(config, world.map(), None, particles).unwrap();
+        if is_anywhere {
+            filter.searching_anywhere()
+        } else {
+            filter
+        }
+    };
+    assert_eq!(
+        [false, true].map(|it| filter(it).compares_places()),
+        [false, true]
+    );
+}
+
+#[test]
+fn a_search_that_a_scan_did_not_confirm_finds_a_tilted_sensor_next_to_its_particles() {
+    let world = TestWorld::street();
+    let truth = world.pose_at(12.0, 0.2, 0.05);
+    // In a hand: the particles assume a level sensor.
+    let tilted = SensorAttitude {
+        pitch_rad: 0.12,
+        ..SensorAttitude::default()
+    };
+    let scan = world.scan_in_space(&world.ground.lift(&truth, &tilted).unwrap().unwrap());
+    let is_found = |phase: Phase| {
+        let mut filter = tracking(LocalizerConfig::of_test(6), truth, Matrix3::zeros());
+        filter.particles = ParticleSet::uniform([truth * Pose2::translation(0.3, 0.3); 6]);
+        filter.phase = phase;
+        filter.pending = None;
+        let mut rng = StdRng::seed_from_u64(1);
+        let still = Odometry::Increment(Pose2::identity());
+        let states = [0; 2].map(|_| {
+            let estimate = filter.step(still, &scan, &SensorAttitude::default(), &mut rng);
+            let estimate = estimate.unwrap();
+            let error_m = deviation(&estimate.pose, &truth).xy().norm();
+            (error_m < 0.02, estimate.state)
+        });
+        // Another pose than that of the particles is confirmed by the next scan.
+        let [(is_right, first), second] = states;
+        is_right && first != State::Tracking && second == (true, State::Tracking)
+    };
+    let search = Search::Around;
+    let searching = |updates: usize| Phase::Searching { search, updates };
+    assert!(is_found(searching(1)) && is_found(Phase::Lost { search }));
+    assert!(!is_found(searching(0)));
 }
 
 #[test]
@@ -582,10 +630,12 @@ fn a_restart_keeps_particles_where_the_car_was_because_the_alarm_may_be_false() 
         sensor_height_m: SensorAttitude::default().height_m,
         config: PanoramaConfig::default(),
     };
-    let config = LocalizerConfig {
+    let mut config = LocalizerConfig {
         num_reduced: 80,
         ..LocalizerConfig::of_test(500)
     };
+    // As in a map that is as small as the surroundings of a given pose.
+    config.places.known_start_m = 1000.0;
     // On the pavement, where no panorama is; three quarters of the weight on the left one.
     let [left, right] = [6.0, -6.0].map(|y| world.pose_at(-20.0, y, 0.0));
     let mut start = ParticleSet::uniform([left, right]);
@@ -599,7 +649,7 @@ fn a_restart_keeps_particles_where_the_car_was_because_the_alarm_may_be_false() 
     filter
         .prepare_next(&scan, &SensorAttitude::default(), &mut rng)
         .unwrap();
-    assert_eq!(filter.phase.reported(true), State::Searching);
+    assert_eq!(filter.phase, Phase::searching(Search::Anywhere));
     let copies = |pose: Pose2| {
         filter
             .particles

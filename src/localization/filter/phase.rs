@@ -96,7 +96,7 @@ impl Evidence {
 }
 
 impl Search {
-    /// The search of particles with which it starts.
+    /// The search of particles around a given pose.
     pub fn from_particles(particles: &ParticleSet, config: &PlacesConfig) -> Self {
         if spread(&particles.covariance_about(&particles.mean())).0 > config.known_start_m {
             Self::Anywhere
@@ -107,12 +107,9 @@ impl Search {
 }
 
 impl Phase {
-    /// The phase of particles with which a search starts.
-    pub fn from_particles(particles: &ParticleSet, config: &PlacesConfig) -> Self {
-        Self::Searching {
-            search: Search::from_particles(particles, config),
-            updates: 0,
-        }
+    /// A search that begins.
+    pub fn searching(search: Search) -> Self {
+        Self::Searching { search, updates: 0 }
     }
 
     /// The phase after an update: the table in the head of this module.
@@ -156,6 +153,15 @@ impl Phase {
     /// Whether one pose is followed.
     pub fn is_tracking(self) -> bool {
         matches!(self, Self::Tracking | Self::Uncertain)
+    }
+
+    /// Whether a pose is searched that the last scan did not confirm.
+    pub fn is_unconfirmed(self) -> bool {
+        match self {
+            Self::Searching { updates, .. } => updates > 0,
+            Self::Lost { .. } => true,
+            Self::Tracking | Self::Uncertain => false,
+        }
     }
 
     /// What the particles represent; `None` while one pose is followed.

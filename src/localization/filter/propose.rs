@@ -5,6 +5,7 @@ use rand::Rng;
 
 use super::phase::Phase;
 use super::reweight::Update;
+use super::search::{PLACE_BEAMS, PLACE_TOLERANCE_M, WIDE_KERNEL_M};
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
@@ -13,14 +14,26 @@ use crate::localization::observation::{
 };
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
+use crate::localization::places::is_same;
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::SensorAttitude;
-use crate::registration::{RegistrationConfig, register, register_informative};
+use crate::registration::{
+    RegistrationConfig, register, register_coarse_to_fine, register_informative,
+};
 use crate::rendering::RenderError;
 
 /// Distance from the prior beyond which a registration is rejected (standard deviations): of normal errors of x, y and heading,
 /// one in 13 million is beyond 6, so that one farther off is no error of the prediction.
 const MAX_SIGMAS: f64 = 6.0;
+
+/// Where a registration may lead.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Basin {
+    /// To a pose that the prediction allows, from a start or else from the prediction.
+    Pose { start: Option<Pose3> },
+    /// To any pose in the place.
+    Place,
+}
 
 /// Distribution of the pose of a frame, given prediction and scan.
 pub(super) struct Posterior {
@@ -31,7 +44,7 @@ pub(super) struct Posterior {
     /// Height of the ground [m].
     level_m: f64,
     attitude: SensorAttitude,
-    /// Whether the registration refutes the prediction.
+    /// Whether the registration refutes the prediction, or replaces one that no scan confirmed.
     pub(super) refutes: bool,
 }
 
@@ -80,6 +93,27 @@ impl ParticleFilter {
         start: Option<Pose3>,
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
+        self.registered_and_fused(scan, attitude, Basin::Pose { start }, rng)
+    }
+
+    /// As [`propose`](Self::propose) for particles that have converged to a pose that no scan confirmed: the registration begins with a
+    /// wide kernel, and a result elsewhere in the place is as good as the prediction until the next scan.
+    pub(super) fn propose_widely(
+        &self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Posterior>, RenderError> {
+        self.registered_and_fused(scan, attitude, Basin::Place, rng)
+    }
+
+    fn registered_and_fused(
+        &self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        basin: Basin,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Posterior>, RenderError> {
         let config = &self.config.proposal;
         if !config.scan {
             return Ok(None);
@@ -96,11 +130,28 @@ impl ParticleFilter {
         };
         let is_plausible = |pose: &Pose2| prior.squared_distance(pose) <= MAX_SIGMAS.powi(2);
         let predicted = patch.lift(&mean, attitude);
-        let start = start
-            .filter(|start| is_plausible(&pose2_from_pose3(start)))
-            .unwrap_or(predicted);
         let renderer = &*self.map.renderer;
         let registration = self.registration();
+        let is_in_place = |pose: &Pose2| is_same(&mean, pose, self.config.places.radius_m);
+        let start = match basin {
+            Basin::Pose { start } => start
+                .filter(|start| is_plausible(&pose2_from_pose3(start)))
+                .unwrap_or(predicted),
+            Basin::Place => {
+                let step = registered.len().div_ceil(PLACE_BEAMS).max(1);
+                let some: Vec<Beam> = registered.iter().step_by(step).copied().collect();
+                let config = registration.with_tolerance(PLACE_TOLERANCE_M);
+                let found = register_coarse_to_fine(
+                    renderer,
+                    [&some, &some],
+                    &predicted,
+                    WIDE_KERNEL_M,
+                    &config,
+                    |pose| is_in_place(&pose2_from_pose3(pose)),
+                )?;
+                found.map_or(predicted, |found| found.map_from_lidar)
+            }
+        };
         let Some(found) = register_informative(renderer, &registered, &start, &registration)?
         else {
             return Ok(None);
@@ -110,7 +161,9 @@ impl ParticleFilter {
             return Ok(None);
         };
         let refutes = !is_plausible(&pose);
-        if refutes && !self.is_refuted(&predicted, &found.map_from_lidar, (&beams, attitude))? {
+        let is_free = basin == Basin::Place && is_in_place(&pose);
+        let replaces = || self.is_refuted(&predicted, &found.map_from_lidar, (&beams, attitude));
+        if refutes && !is_free && !replaces()? {
             return Ok(None);
         }
         let prior = if refutes {

@@ -2,7 +2,7 @@
 
 use rand::Rng;
 
-use super::phase::Phase;
+use super::phase::{Phase, Search};
 use super::state::{ParticleFilter, Updated};
 use crate::lidar::RangeImage;
 use crate::localization::initialization::from_panoramas;
@@ -57,7 +57,7 @@ impl ParticleFilter {
         let before = self.particles.particles();
         particles.extend(kept.into_iter().map(|index| before[index]));
         self.particles = ParticleSet::uniform(particles);
-        self.phase = Phase::from_particles(&self.particles, &self.config.places);
+        self.phase = Phase::searching(Search::Anywhere);
         // Valid until the next update.
         self.updated = Updated::from_particles(&self.particles);
         self.last_motion = None;

@@ -22,7 +22,7 @@ pub(super) struct Update {
     pub(super) attitude: SensorAttitude,
     /// Pose of the posterior, or of the likeliest of several places; `None` for the weighted mean.
     pub(super) pose: Option<Pose2>,
-    /// Whether the scan shows that the prediction is wrong.
+    /// Whether the scan shows that the prediction is wrong, or replaces one that no scan confirmed.
     pub(super) refutes: bool,
 }
 
@@ -119,13 +119,17 @@ impl ParticleFilter {
         estimate.mean_cost_m = update.mean_cost_m;
         let is_narrow = self.is_narrow();
         // A jump of a wide distribution is not a motion of the car, nor is the correction of a refuted prediction. One that follows
-        // another is: the car moved otherwise than predicted.
-        let is_motion = !update.refutes || self.updated.refuted;
+        // another is while tracking: the car moved otherwise than predicted.
+        let is_motion = !update.refutes || self.updated.refuted && self.phase.is_tracking();
         if self.updated.is_narrow && is_narrow && is_motion {
             self.last_motion = Some(LastMotion {
                 increment: self.updated.pose.inverse() * pose,
                 duration_s: self.duration_s,
             });
+        }
+        // Predictions of a search that are wrong in turn had a wrong motion.
+        if update.refutes && self.updated.refuted && !self.phase.is_tracking() {
+            self.last_motion = None;
         }
         self.updated = Updated {
             pose,

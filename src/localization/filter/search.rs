@@ -20,6 +20,15 @@ use crate::map::{GroundPatch, SensorAttitude};
 use crate::registration::{RegistrationResult, register_coarse_to_fine};
 use crate::rendering::RenderError;
 
+/// Number of beams that are registered at a place.
+pub(super) const PLACE_BEAMS: usize = 800;
+
+/// Tolerance of their registration [m]: steps of 800 beams, whose noise is millimetres, do not get below that of the configuration.
+pub(super) const PLACE_TOLERANCE_M: f64 = 1e-3;
+
+/// Scale of the robust kernel for particles that are a metre off [m].
+pub(super) const WIDE_KERNEL_M: f64 = 0.4;
+
 /// A place where the car may be.
 struct PlaceHypothesis {
     /// Registered pose where registration succeeded, else that of a particle.
@@ -128,15 +137,12 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Vec<PlaceHypothesis>, RenderError> {
-        /// Number of registered beams.
-        const BEAMS: usize = 800;
-        /// Scale of the robust kernel for particles that are a metre off [m].
-        const WIDE_KERNEL_M: f64 = 0.4;
-        /// Tolerance [m]: steps of 800 beams, whose noise is millimetres, do not get below that of the configuration.
-        const TOLERANCE_M: f64 = 1e-3;
         let config = &self.config.proposal;
-        let beams = choose_beams(scan, BEAMS, config.road_share, attitude, rng);
-        let registration = config.registration.cautious().with_tolerance(TOLERANCE_M);
+        let beams = choose_beams(scan, PLACE_BEAMS, config.road_share, attitude, rng);
+        let registration = config
+            .registration
+            .cautious()
+            .with_tolerance(PLACE_TOLERANCE_M);
         let radius_m = self.config.places.radius_m;
         let place = |&seed: &usize| {
             let particle = &self.particles.particles()[seed];

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::phase::Phase;
+use super::phase::{Phase, Search};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::PERIOD_S;
 use crate::localization::config::LocalizerConfig;
@@ -48,7 +48,7 @@ pub(super) struct Updated {
     pub covariance: Matrix3<f64>,
     /// Whether the distribution around it was narrow.
     pub is_narrow: bool,
-    /// Whether its scan refuted the prediction: the next one has to confirm it.
+    /// Whether its scan refuted the prediction, or replaced one that no scan confirmed: the next one has to confirm it.
     pub refuted: bool,
 }
 
@@ -96,7 +96,7 @@ impl ParticleFilter {
         let level_m = particles.best().level_m;
         Ok(Self {
             patch: map.ground.patch_under(&updated.pose, level_m)?,
-            phase: Phase::from_particles(&particles, &config.places),
+            phase: Phase::searching(Search::from_particles(&particles, &config.places)),
             config,
             map,
             restart,
@@ -109,6 +109,14 @@ impl ParticleFilter {
             registration_start: None,
             attitude: None,
         })
+    }
+
+    /// The same filter before its first scan, whose particles are in the places that resemble this scan: several ones, also where
+    /// all of the map is as small as the surroundings of a pose.
+    #[must_use]
+    pub fn searching_anywhere(mut self) -> Self {
+        self.phase = Phase::searching(Search::Anywhere);
+        self
     }
 
     /// Sets the time between the previous frame and the next [s].

@@ -3,7 +3,7 @@
 use nalgebra::Matrix3;
 use rand::Rng;
 
-use super::phase::{Evidence, Phase};
+use super::phase::{Evidence, Phase, Search};
 use super::reweight::Update;
 use super::state::{ParticleFilter, Pending};
 use crate::geometry::{Pose2, Pose3};
@@ -38,6 +38,8 @@ impl ParticleFilter {
         self.propagate(odometry, rng);
         let posterior = if self.phase.is_tracking() {
             self.propose(scan, attitude, start, rng)?
+        } else if self.has_converged_in_vain() {
+            self.propose_widely(scan, attitude, rng)?
         } else {
             None
         };
@@ -46,7 +48,7 @@ impl ParticleFilter {
             None => self.reweight_widely(scan, attitude, rng)?,
         };
         let mut estimate = self.compared_estimate(&update)?;
-        let mut evidence = self.evidence(&estimate, odometry);
+        let mut evidence = self.evidence(&estimate, odometry, update.refutes);
         let is_found = evidence.is_confirmed && !self.phase.is_tracking();
         if is_found
             && let Some(posterior) = self.propose(scan, &update.attitude, None, rng)?
@@ -67,6 +69,14 @@ impl ParticleFilter {
         estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
+    }
+
+    /// Whether the particles are at one pose that the last scan did not confirm. They have the attitude and height that are assumed,
+    /// and converge next to the right pose where a hand tilts the sensor.
+    fn has_converged_in_vain(&self) -> bool {
+        let is_one_place =
+            !matches!(self.phase.search(), Some(Search::Places { likely }) if likely > 1);
+        self.phase.is_unconfirmed() && is_one_place && self.is_narrow()
     }
 
     /// The estimate after an update, with its agreement with the map.
@@ -197,8 +207,9 @@ impl ParticleFilter {
         Ok(agreement(&beams, &rendered_m, tolerance_m))
     }
 
-    /// What an update shows, of which the averages of the agreement are kept.
-    fn evidence(&mut self, estimate: &Estimate, odometry: Odometry) -> Evidence {
+    /// What an update shows, of which the averages of the agreement are kept. A pose that replaces the prediction is not
+    /// confirmed by its own scan, and restarts the count.
+    fn evidence(&mut self, estimate: &Estimate, odometry: Odometry, refutes: bool) -> Evidence {
         let config = &self.config.tracking_loss;
         let agreement = estimate.agreement;
         // Without a known motion the next frame cannot be predicted.
@@ -212,7 +223,9 @@ impl ParticleFilter {
         Evidence {
             disagrees: self.agreement.is_lost(config),
             is_scattered: spread(&covariance).0 > config.max_spread_m,
-            is_confirmed: self.agreement.confirm(is_converged, agreement, config),
+            is_confirmed: self
+                .agreement
+                .confirm(is_converged && !refutes, agreement, config),
             are_alike: agreement >= Some(config.min_agreement) && self.compares_places(),
             is_precise: self.is_precise(&estimate.covariance),
             is_twice_as_precise: self.is_precise(&(estimate.covariance * 4.0)),
