@@ -84,15 +84,15 @@ impl Sensor {
         recording: &Recording,
         known: &SensorConfig,
     ) -> Result<Self, SensorError> {
-        Self::infer_expected(recording, known, None)
+        Self::infer_with_expected(recording, known, None)
     }
 
-    /// As [`infer_recording`](Self::infer_recording), where the recording is expected to be of a sensor, such as that of the map: its
-    /// rotation is taken if it fits clearly best, without a comparison with all others.
+    /// The sensor of a recording that is expected to be of a known one, such as that of the map: the rotation of that one is taken if it
+    /// fits clearly best, without a comparison with all others.
     ///
     /// # Errors
     /// As [`infer_recording`](Self::infer_recording).
-    pub fn infer_expected(
+    pub fn infer_with_expected(
         recording: &Recording,
         known: &SensorConfig,
         expected: Option<&Self>,

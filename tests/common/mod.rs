@@ -151,7 +151,8 @@ pub fn simulate_two_drives(folder: &Path, config: &str) {
     }
 }
 
-/// A folder for several tests, in the build folder: nothing removes it when the program ends. Those that are a day old are removed.
+/// A new folder for several tests, in the build folder, since nothing removes it when the program ends. Those that are a day old are
+/// removed.
 pub fn shared_folder() -> TempDir {
     const DAY: Duration = Duration::from_secs(86_400);
     let parent = Path::new(env!("CARGO_TARGET_TMPDIR")).join("shared");

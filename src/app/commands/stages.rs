@@ -75,7 +75,8 @@ impl<'a> RecordingInputs<'a> {
     }
 
     /// Opens the selected frames, with the true poses in the frame of a map, and completes what is known about the sensor
-    /// by what the scans show, unless all of it is `found`: what the same scans have shown before.
+    /// by what the scans show. `found` is what an earlier command inferred from the same scans: nothing is inferred again where it is
+    /// complete and equal to what is known.
     pub fn open_in_map(
         &self,
         map: &Map,
@@ -91,7 +92,7 @@ impl<'a> RecordingInputs<'a> {
         let found = found.filter(|found| is_complete && *found == known);
         let sensor = match found.and_then(Sensor::configured) {
             Some(sensor) => sensor,
-            None => Sensor::infer_expected(&recording, known, map.path.sensor.as_ref())?,
+            None => Sensor::infer_with_expected(&recording, known, map.path.sensor.as_ref())?,
         };
         *known = SensorConfig::from(&sensor);
         Ok((sensor.applied_to(recording), sensor))

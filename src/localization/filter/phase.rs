@@ -155,7 +155,7 @@ impl Phase {
         matches!(self, Self::Tracking | Self::Uncertain)
     }
 
-    /// Whether a pose is searched that the last scan did not confirm.
+    /// Whether a pose is searched and the last scan confirmed none.
     pub fn is_unconfirmed(self) -> bool {
         match self {
             Self::Searching { updates, .. } => updates > 0,

@@ -5,7 +5,7 @@ use rand::Rng;
 
 use super::phase::Phase;
 use super::reweight::Update;
-use super::search::{PLACE_BEAMS, PLACE_TOLERANCE_M, WIDE_KERNEL_M};
+use super::search::PLACE_BEAMS;
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
@@ -17,9 +17,7 @@ use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::is_same;
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::SensorAttitude;
-use crate::registration::{
-    RegistrationConfig, register, register_coarse_to_fine, register_informative,
-};
+use crate::registration::{RegistrationConfig, register, register_informative};
 use crate::rendering::RenderError;
 
 /// Distance from the prior beyond which a registration is rejected (standard deviations): of normal errors of x, y and heading,
@@ -93,21 +91,22 @@ impl ParticleFilter {
         start: Option<Pose3>,
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
-        self.registered_and_fused(scan, attitude, Basin::Pose { start }, rng)
+        self.propose_in(scan, attitude, Basin::Pose { start }, rng)
     }
 
-    /// As [`propose`](Self::propose) for particles that have converged to a pose that no scan confirmed: the registration begins with a
-    /// wide kernel, and a result elsewhere in the place is as good as the prediction until the next scan.
+    /// The same for particles that have converged to a pose that no scan confirmed: the registration begins with a wide kernel, and a
+    /// result elsewhere in the place replaces the prediction until the next scan.
     pub(super) fn propose_widely(
         &self,
         scan: &RangeImage,
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
-        self.registered_and_fused(scan, attitude, Basin::Place, rng)
+        self.propose_in(scan, attitude, Basin::Place, rng)
     }
 
-    fn registered_and_fused(
+    /// [`propose`](Self::propose) and [`propose_widely`](Self::propose_widely).
+    fn propose_in(
         &self,
         scan: &RangeImage,
         attitude: &SensorAttitude,
@@ -132,7 +131,6 @@ impl ParticleFilter {
         let predicted = patch.lift(&mean, attitude);
         let renderer = &*self.map.renderer;
         let registration = self.registration();
-        let is_in_place = |pose: &Pose2| is_same(&mean, pose, self.config.places.radius_m);
         let start = match basin {
             Basin::Pose { start } => start
                 .filter(|start| is_plausible(&pose2_from_pose3(start)))
@@ -140,15 +138,7 @@ impl ParticleFilter {
             Basin::Place => {
                 let step = registered.len().div_ceil(PLACE_BEAMS).max(1);
                 let some: Vec<Beam> = registered.iter().step_by(step).copied().collect();
-                let config = registration.with_tolerance(PLACE_TOLERANCE_M);
-                let found = register_coarse_to_fine(
-                    renderer,
-                    [&some, &some],
-                    &predicted,
-                    WIDE_KERNEL_M,
-                    &config,
-                    |pose| is_in_place(&pose2_from_pose3(pose)),
-                )?;
+                let found = self.registered_in_place(&some, &predicted, &mean)?;
                 found.map_or(predicted, |found| found.map_from_lidar)
             }
         };
@@ -161,9 +151,12 @@ impl ParticleFilter {
             return Ok(None);
         };
         let refutes = !is_plausible(&pose);
-        let is_free = basin == Basin::Place && is_in_place(&pose);
-        let replaces = || self.is_refuted(&predicted, &found.map_from_lidar, (&beams, attitude));
-        if refutes && !is_free && !replaces()? {
+        let is_allowed =
+            basin == Basin::Place && is_same(&mean, &pose, self.config.places.radius_m);
+        if refutes
+            && !is_allowed
+            && !self.is_refuted(&predicted, &found.map_from_lidar, (&beams, attitude))?
+        {
             return Ok(None);
         }
         let prior = if refutes {

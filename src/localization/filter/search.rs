@@ -23,12 +23,6 @@ use crate::rendering::RenderError;
 /// Number of beams that are registered at a place.
 pub(super) const PLACE_BEAMS: usize = 800;
 
-/// Tolerance of their registration [m]: steps of 800 beams, whose noise is millimetres, do not get below that of the configuration.
-pub(super) const PLACE_TOLERANCE_M: f64 = 1e-3;
-
-/// Scale of the robust kernel for particles that are a metre off [m].
-pub(super) const WIDE_KERNEL_M: f64 = 0.4;
-
 /// A place where the car may be.
 struct PlaceHypothesis {
     /// Registered pose where registration succeeded, else that of a particle.
@@ -129,7 +123,29 @@ impl ParticleFilter {
         Ok(unique.into_iter().collect())
     }
 
-    /// Registers the scan at particles, with a wide kernel first.
+    /// Registers [`PLACE_BEAMS`] beams at a pose in a place, with a wide kernel first; `None` where that fails or leads out of the place.
+    pub(super) fn registered_in_place(
+        &self,
+        beams: &[Beam],
+        start: &Pose3,
+        place: &Pose2,
+    ) -> Result<Option<RegistrationResult>, RenderError> {
+        /// Scale of the robust kernel for particles that are a metre off [m].
+        const WIDE_KERNEL_M: f64 = 0.4;
+        /// Tolerance [m]: steps of 800 beams, whose noise is millimetres, do not get below that of the configuration.
+        const TOLERANCE_M: f64 = 1e-3;
+        let registration = self.config.proposal.registration.cautious();
+        register_coarse_to_fine(
+            &*self.map.renderer,
+            [beams, beams],
+            start,
+            WIDE_KERNEL_M,
+            &registration.with_tolerance(TOLERANCE_M),
+            |pose| is_same(place, &pose2_from_pose3(pose), self.config.places.radius_m),
+        )
+    }
+
+    /// Registers the scan at particles.
     fn registered_places(
         &self,
         seeds: &[usize],
@@ -137,12 +153,8 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Vec<PlaceHypothesis>, RenderError> {
-        let config = &self.config.proposal;
-        let beams = choose_beams(scan, PLACE_BEAMS, config.road_share, attitude, rng);
-        let registration = config
-            .registration
-            .cautious()
-            .with_tolerance(PLACE_TOLERANCE_M);
+        let road_share = self.config.proposal.road_share;
+        let beams = choose_beams(scan, PLACE_BEAMS, road_share, attitude, rng);
         let radius_m = self.config.places.radius_m;
         let place = |&seed: &usize| {
             let particle = &self.particles.particles()[seed];
@@ -151,14 +163,7 @@ impl ParticleFilter {
             };
             let start = particle.map_from_lidar;
             let lifted = patch.lift(&start, attitude);
-            let found = register_coarse_to_fine(
-                &*self.map.renderer,
-                [&beams, &beams],
-                &lifted,
-                WIDE_KERNEL_M,
-                &registration,
-                |pose| is_same(&start, &pose2_from_pose3(pose), radius_m),
-            )?;
+            let found = self.registered_in_place(&beams, &lifted, &start)?;
             let covariance = (found.as_ref()).map(RegistrationResult::planar_covariance);
             let pose = found.map_or(lifted, |found| found.map_from_lidar);
             let mean = pose2_from_pose3(&pose);

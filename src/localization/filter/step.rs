@@ -38,7 +38,7 @@ impl ParticleFilter {
         self.propagate(odometry, rng);
         let posterior = if self.phase.is_tracking() {
             self.propose(scan, attitude, start, rng)?
-        } else if self.has_converged_in_vain() {
+        } else if self.has_converged_unconfirmed() {
             self.propose_widely(scan, attitude, rng)?
         } else {
             None
@@ -73,7 +73,7 @@ impl ParticleFilter {
 
     /// Whether the particles are at one pose that the last scan did not confirm. They have the attitude and height that are assumed,
     /// and converge next to the right pose where a hand tilts the sensor.
-    fn has_converged_in_vain(&self) -> bool {
+    fn has_converged_unconfirmed(&self) -> bool {
         let is_one_place =
             !matches!(self.phase.search(), Some(Search::Places { likely }) if likely > 1);
         self.phase.is_unconfirmed() && is_one_place && self.is_narrow()

@@ -270,7 +270,7 @@ impl GroundSurface {
         }
         // A cell may have as many surfaces as the mesh has triangles: they are sorted and searched by bisection.
         let mut sorted = components.to_vec();
-        // Per cell, where its surfaces begin: the lowest surface of a large component, and the lowest of another one.
+        // The lowest surface of a large component, and the lowest of another one, of each cell at its first surface.
         let mut lowest_large: Vec<[Option<u32>; 2]> = vec![[None; 2]; components.len()];
         for of_cell in self.surfaces.chunk_by(|a, b| a.cell() == b.cell()) {
             let all = self.in_cell(of_cell[0].cell());
@@ -301,16 +301,13 @@ impl GroundSurface {
             if [(1, 0), (-1, 0), (0, 1), (0, -1)].into_iter().all(has_own) {
                 continue;
             }
+            let is_below = |&other: &u32| {
+                components[other as usize] != own
+                    && self.surfaces[other as usize].high_m < surface.low_m - below_m
+            };
             let has_below = |offset| {
                 let cell = self.in_cell(neighbour(offset));
-                let lowest = lowest_large.get(cell.start).filter(|_| !cell.is_empty());
-                let mut others = (lowest
-                    .into_iter()
-                    .flatten()
-                    .flatten()
-                    .map(|&it| it as usize))
-                .filter(|&other| components[other] != own);
-                others.any(|other| self.surfaces[other].high_m < surface.low_m - below_m)
+                !cell.is_empty() && lowest_large[cell.start].iter().flatten().any(is_below)
             };
             rim[own as usize] += 1;
             above[own as usize] += u32::from(cells_within(RIM_CELLS).any(has_below));
