@@ -163,14 +163,34 @@ impl Motion {
     /// Moves the points of a scan to the moment of its pose; its rotation is the measured one where there is one. Afterwards
     /// the scan has no times; a scan without times is unchanged.
     pub fn deskew(&self, scan: &mut Scan) {
+        let deskewing = self.deskewing(scan);
+        let points = scan.points.par_iter_mut().zip(&scan.times_s);
+        points.for_each(|(point, &time_s)| *point = deskewing.moved(*point, time_s));
+        scan.times_s.clear();
+    }
+
+    /// How the points of a scan are moved to the moment of its pose.
+    pub(crate) fn deskewing(&self, scan: &Scan) -> Deskewing {
         let sweep = Sweep::spanning(scan.times_s.iter().copied());
         let turns = sweep.turns(scan.measured_rotation().as_ref());
-        let transforms = sweep.transforms(self, turns.as_deref());
-        let points = scan.points.par_iter_mut().zip(&scan.times_s);
-        points.for_each(|(point, &time_s)| {
-            *point = transforms[sweep.interval(time_s)].apply(*point);
-        });
-        scan.times_s.clear();
+        Deskewing {
+            sweep,
+            transforms: sweep.transforms(self, turns.as_deref()),
+        }
+    }
+}
+
+/// Transforms of the points of a scan to the moment of its pose, by their times.
+pub struct Deskewing {
+    sweep: Sweep,
+    transforms: Vec<Rigid3f>,
+}
+
+impl Deskewing {
+    /// A point that was measured at a time [s], at the moment of the pose.
+    #[inline]
+    pub fn moved(&self, point: Vec3, time_s: f32) -> Vec3 {
+        self.transforms[self.sweep.interval(time_s)].apply(point)
     }
 }
 

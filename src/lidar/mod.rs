@@ -21,5 +21,5 @@ pub(crate) use deskewing::{PERIOD_S, Sweep, interpolate_motion};
 pub(crate) use firing_order::FiringOrder;
 pub(crate) use normals::estimate_normals;
 pub(crate) use projection::Projection;
-pub(crate) use scan::interval_s;
+pub(crate) use scan::{interval_s, is_inside};
 pub(crate) use spatial_normals::estimate_spatial_normals;

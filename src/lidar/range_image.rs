@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::model::LidarModel;
 use super::projection::Projection;
 use super::scan::Beam;
+use crate::geometry::fast_atan2;
 
 /// Range of a pixel without a return.
 pub const NO_RETURN: f32 = f32::INFINITY;
@@ -29,29 +30,45 @@ impl RangeImage {
     /// Projects points of the lidar frame; a pixel keeps the nearest, the first among equals. Points
     /// that are not finite or are outside the field of view or the range limits are ignored.
     pub fn project(points: &[Vec3], model: &LidarModel) -> Self {
-        let mut image = Self {
-            model: model.clone(),
-            ranges: vec![NO_RETURN; model.len()],
-            points: vec![Vec3::ZERO; model.len()],
-            point_indices: vec![NO_POINT; model.len()],
-        };
+        Self::project_each(points.len(), |number| Some(points[number]), model)
+    }
+
+    /// The same of points by their numbers; `None` for those that are left out.
+    pub(crate) fn project_each(
+        count: usize,
+        point_of: impl Fn(usize) -> Option<Vec3> + Sync,
+        model: &LidarModel,
+    ) -> Self {
         let projection = Projection::of(model);
-        let range_and_pixel = |point: &Vec3| {
-            let range_m = point.length();
-            let pixel = (model.accepts_range(range_m)).then(|| projection.pixel_of(*point));
-            pixel.flatten().map(|index| (range_m, index))
+        let range_and_pixel = |number: usize| {
+            let found = point_of(number).and_then(|point| {
+                let range_m = point.length();
+                let azimuth_rad = fast_atan2(point.y, point.x);
+                let pixel = (model.accepts_range(range_m))
+                    .then(|| projection.pixel_at(point.z / range_m, azimuth_rad));
+                Some((range_m, pixel.flatten()? as u32))
+            });
+            found.unwrap_or((NO_RETURN, 0))
         };
-        let found: Vec<Option<(f32, usize)>> = points.par_iter().map(range_and_pixel).collect();
-        for (point_index, (&point, found)) in points.iter().zip(found).enumerate() {
-            if let Some((range_m, index)) = found
-                && range_m < image.ranges[index]
-            {
-                image.ranges[index] = range_m;
-                image.points[index] = point;
-                image.point_indices[index] = point_index as u32;
+        let found = (0..count).into_par_iter().map(range_and_pixel);
+        let found: Vec<(f32, u32)> = found.collect();
+        let mut ranges = vec![NO_RETURN; model.len()];
+        let mut point_indices = vec![NO_POINT; model.len()];
+        for (number, (range_m, pixel)) in found.into_iter().enumerate() {
+            let pixel = pixel as usize;
+            if range_m != NO_RETURN && range_m < ranges[pixel] {
+                ranges[pixel] = range_m;
+                point_indices[pixel] = number as u32;
             }
         }
-        image
+        let nearest = |&number: &u32| (number != NO_POINT).then(|| point_of(number as usize));
+        let points = (point_indices.par_iter()).map(|it| nearest(it).flatten().unwrap_or_default());
+        Self {
+            model: model.clone(),
+            ranges,
+            points: points.collect(),
+            point_indices,
+        }
     }
 
     /// An image of ranges [m], row-major, infinite without a return, with points on the rays through the pixel centres.

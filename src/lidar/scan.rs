@@ -118,8 +118,8 @@ impl Scan {
 
     /// Drops the points inside a rectangle of the lidar frame, x_min, x_max, y_min, y_max [m], such as
     /// the own car. Returns how many.
-    pub(crate) fn drop_inside(&mut self, [x_min, x_max, y_min, y_max]: [f32; 4]) -> usize {
-        self.retain(|p| !(p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max))
+    pub(crate) fn drop_inside(&mut self, rectangle_m: [f32; 4]) -> usize {
+        self.retain(|point| !is_inside(*point, rectangle_m))
     }
 
     /// Moves the moment of the scan to the middle of its sweep, and rounds times to microseconds, so that the same
@@ -153,6 +153,12 @@ impl Scan {
 /// same intervals [s].
 pub fn interval_s(earlier_s: f64, later_s: f64) -> f64 {
     1e-6 * (1e6 * (later_s - earlier_s)).round()
+}
+
+/// Whether a point is above or below the inside of a rectangle, x_min, x_max, y_min, y_max [m].
+#[inline]
+pub(crate) fn is_inside(point: Vec3, [x_min, x_max, y_min, y_max]: [f32; 4]) -> bool {
+    point.x > x_min && point.x < x_max && point.y > y_min && point.y < y_max
 }
 
 /// Keeps the values whose flag is set.

@@ -1,7 +1,7 @@
 //! Preparation of scans: range images, and the attitude of the sensor above the ground.
 
 use crate::ground::{GroundClassifier, GroundConfig, RoadConfig, road_plane};
-use crate::lidar::{Motion, RangeImage, Scan};
+use crate::lidar::{Motion, RangeImage, Scan, is_inside};
 use crate::map::SensorAttitude;
 use crate::sensor::Sensor;
 use crate::validation::{InvalidValue, Validate as _};
@@ -37,12 +37,16 @@ impl ScanPreparation {
 
     /// Projects a scan, deskewed by a motion, without the points on the own car and out of range.
     pub fn range_image(&self, scan: &Scan, motion: Option<&Motion>) -> RangeImage {
-        let mut scan = scan.clone();
-        scan.drop_inside(self.sensor.own_car_m);
-        if let Some(motion) = motion {
-            motion.deskew(&mut scan);
-        }
-        RangeImage::project(&scan.points, &self.sensor.range_image)
+        let deskewing = motion.map(|motion| motion.deskewing(scan));
+        let moved = |number: usize| {
+            let point = scan.points[number];
+            let is_kept = !is_inside(point, self.sensor.own_car_m);
+            is_kept.then(|| match (&deskewing, scan.times_s.get(number)) {
+                (Some(deskewing), Some(&time_s)) => deskewing.moved(point, time_s),
+                _ => point,
+            })
+        };
+        RangeImage::project_each(scan.len(), moved, &self.sensor.range_image)
     }
 
     /// Attitude of the sensor above the ground in the scan, with the given height if there is one; `None` where too
@@ -59,5 +63,51 @@ impl ScanPreparation {
             height_m: self.sensor.sensor_height_m.unwrap_or(measured.height_m),
             ..measured
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Pose3, Vec3};
+    use crate::sensor::SensorConfig;
+
+    #[test]
+    fn a_range_image_is_that_of_the_deskewed_points_outside_of_the_own_car() {
+        let points: Vec<Vec3> = (0..4000)
+            .map(|number| {
+                let (sine, cosine) = (0.01 * number as f32).sin_cos();
+                let range_m = 2.0 + 0.005 * number as f32;
+                Vec3::new(range_m * cosine, range_m * sine, -0.002 * number as f32)
+            })
+            .collect();
+        let scan = Scan {
+            times_s: (0..4000).map(|it| 2.5e-5 * it as f32 - 0.05).collect(),
+            points,
+            ..Scan::default()
+        };
+        let mut sensor =
+            Sensor::infer(std::slice::from_ref(&scan), &SensorConfig::default()).unwrap();
+        sensor.own_car_m = [-4.0, 3.0, -2.5, 2.5];
+        let preparation = ScanPreparation::new(&sensor, &GroundConfig::default()).unwrap();
+        let motion = Motion {
+            previous_from_current: Pose3::translation(1.5, 0.1, 0.0),
+            duration_s: 0.1,
+        };
+        for motion in [None, Some(motion)] {
+            let mut moved = scan.clone();
+            if let Some(motion) = &motion {
+                motion.deskew(&mut moved);
+            }
+            let own = |point: &Vec3| is_inside(*point, sensor.own_car_m);
+            let pairs = scan.points.iter().zip(&moved.points);
+            let outside = pairs.filter(|(measured, _)| !own(measured));
+            let expected: Vec<Vec3> = outside.map(|(_, moved)| *moved).collect();
+            assert!(expected.len() < scan.len() - 100);
+            let expected = RangeImage::project(&expected, &sensor.range_image);
+            let found = preparation.range_image(&scan, motion.as_ref());
+            assert!(expected.beams().count() > 500);
+            assert!(found.ranges == expected.ranges && found.points == expected.points);
+        }
     }
 }
