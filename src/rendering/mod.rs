@@ -11,7 +11,6 @@ mod order;
 pub(crate) mod selection;
 
 pub use backend::{Backend, RenderingMethod};
-pub(crate) use order::coherent_order;
 
 pub(crate) use cpu::CpuRenderer;
 
