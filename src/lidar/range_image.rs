@@ -6,7 +6,6 @@ use rayon::prelude::*;
 use super::model::LidarModel;
 use super::projection::Projection;
 use super::scan::Beam;
-use crate::geometry::fast_atan2;
 
 /// Range of a pixel without a return.
 pub const NO_RETURN: f32 = f32::INFINITY;
@@ -43,9 +42,7 @@ impl RangeImage {
         let range_and_pixel = |number: usize| {
             let found = point_of(number).and_then(|point| {
                 let range_m = point.length();
-                let azimuth_rad = fast_atan2(point.y, point.x);
-                let pixel = (model.accepts_range(range_m))
-                    .then(|| projection.pixel_at(point.z / range_m, azimuth_rad));
+                let pixel = (model.accepts_range(range_m)).then(|| projection.pixel_of(point));
                 Some((range_m, pixel.flatten()? as u32))
             });
             found.unwrap_or((NO_RETURN, 0))

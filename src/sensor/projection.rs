@@ -14,7 +14,7 @@ use std::collections::BTreeSet;
 use super::beam::{MAX_BEAMS, angles, quantile};
 use super::beams::Beams;
 use super::dropped::DroppedPoints;
-use crate::lidar::{LidarModel, Scan};
+use crate::lidar::{LidarModel, Scan, is_inside};
 
 /// Columns of a range image, at most and at least.
 const MAX_COLUMNS: usize = 2048;
@@ -131,13 +131,12 @@ fn rowless(scans: &[Scan]) -> LidarModel {
 ///
 /// The greatest is that of nearly all returns, between 50 and 120 m. In a building, where it would be less than 50 m, it is twice
 /// that of nearly all returns, because the next room may be larger. The least is that of nearly all returns apart from the own car, but between 0.3 m, where housings and hands are, and 2 m.
-fn range_limits(scans: &[Scan], [x_min, x_max, y_min, y_max]: [f32; 4]) -> (f32, f32) {
+fn range_limits(scans: &[Scan], own_car_m: [f32; 4]) -> (f32, f32) {
     const NEARLY_ALL: f64 = 0.99;
     /// Range of the HDL-64E and the OS1-64 by their data sheets [m].
     const FARTHEST_M: f32 = 120.0;
-    let is_own = |x: f32, y: f32| x > x_min && x < x_max && y > y_min && y < y_max;
     let mut ranges: Vec<f32> = (scans.iter().flat_map(|scan| &scan.points))
-        .filter(|point| !is_own(point.x, point.y))
+        .filter(|point| !is_inside(**point, own_car_m))
         .map(|point| point.length())
         .collect();
     let nearest = quantile(&mut ranges, 0.1 * (1.0 - NEARLY_ALL));

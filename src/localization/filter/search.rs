@@ -123,7 +123,8 @@ impl ParticleFilter {
         Ok(unique.into_iter().collect())
     }
 
-    /// Registers [`PLACE_BEAMS`] beams at a pose in a place, with a wide kernel first; `None` where that fails or leads out of the place.
+    /// Registers [`PLACE_BEAMS`] beams at a pose in a place, with a wide kernel first; `None` where that fails or leads out of the
+    /// place.
     pub(super) fn registered_in_place(
         &self,
         beams: &[Beam],
