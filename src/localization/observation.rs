@@ -12,6 +12,7 @@
 //! Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021, eq. 6, for the reference.
 
 use rand::{Rng, RngExt as _};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
@@ -19,7 +20,7 @@ use super::particles::Particle;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::map::{GroundPatch, Map, SensorAttitude};
-use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
+use crate::rendering::{RangeDifference, RangeRenderer, RenderError, coherent_order};
 use crate::validation::{
     InvalidValue, Validate, fraction, in_range, positive, positive_or_infinite,
 };
@@ -138,8 +139,7 @@ impl ObservationConfig {
     }
 }
 
-/// Samples about `count` beams evenly over the image, at most `road_share` of them on the road, in the order of the
-/// image.
+/// Samples about `count` beams evenly over an image, at most `road_share` of them on the road, see [`ClassifiedReturns::choose`].
 pub fn choose_beams(
     image: &RangeImage,
     count: usize,
@@ -147,45 +147,85 @@ pub fn choose_beams(
     attitude: &SensorAttitude,
     rng: &mut impl Rng,
 ) -> Vec<Beam> {
-    /// Points below this height above the plane of the road are on the road [m].
-    const ROAD_TOP_M: f32 = 0.3;
-    let road_from_lidar = Rigid3f::from(&attitude.road_from_lidar());
-    let is_road = |index: usize| road_from_lidar.apply(image.points[index]).z < ROAD_TOP_M;
-    let returns = (0..image.ranges.len()).filter(|&index| image.has_return(index));
-    let (road, rest): (Vec<usize>, Vec<usize>) = returns.partition(|&index| is_road(index));
-
-    let largest = (road_share * count as f64).round() as usize;
-    let proportional = count * road.len() / (road.len() + rest.len()).max(1);
-    let of_road = proportional.min(largest);
-    let mut chosen = evenly_spread(&road, of_road, &image.model, rng);
-    chosen.extend(evenly_spread(&rest, count - of_road, &image.model, rng));
-    chosen.sort_unstable();
-    chosen
-        .into_iter()
-        .filter_map(|index| image.beam(index))
-        .collect()
+    ClassifiedReturns::of(image, attitude).choose(count, road_share, rng)
 }
 
-/// Samples about `count` members of a list of pixels, evenly spread over the rows; the whole list if it is shorter.
-///
-/// The pixel of a column c is chosen if frac(c φ + u) is less than the requested share of the list, with the golden
-/// ratio φ, whose multiples are spread most evenly, and a random u for each row. Whether a pixel is chosen
-/// hardly depends on the others, so that almost equal scans give almost equal samples.
-fn evenly_spread(
-    list: &[usize],
-    count: usize,
-    model: &LidarModel,
-    rng: &mut impl Rng,
-) -> Vec<usize> {
-    const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
-    let share = count as f64 / list.len().max(1) as f64;
-    // Of all rows, so that the numbers that are drawn afterwards do not depend on the scan.
-    let offsets: Vec<f64> = (0..model.height).map(|_| rng.random()).collect();
-    let is_chosen = |&pixel: &usize| {
-        let (row, column) = (pixel / model.width, pixel % model.width);
-        (column as f64 * GOLDEN_RATIO + offsets[row]).fract() < share
-    };
-    list.iter().copied().filter(is_chosen).collect()
+/// The returns of a range image, on the road and above it.
+pub struct ClassifiedReturns<'a> {
+    image: &'a RangeImage,
+    /// Of each pixel; `None` without a return.
+    surfaces: Vec<Option<Surface>>,
+}
+
+/// What a beam ends on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Surface {
+    Road,
+    Rest,
+}
+
+impl<'a> ClassifiedReturns<'a> {
+    /// Tells the road from the rest.
+    pub fn of(image: &'a RangeImage, attitude: &SensorAttitude) -> Self {
+        /// Points below this height above the plane of the road are on the road [m].
+        const ROAD_TOP_M: f32 = 0.3;
+        let road_from_lidar = Rigid3f::from(&attitude.road_from_lidar());
+        let surface = |index: usize| {
+            let is_road = || road_from_lidar.apply(image.points[index]).z < ROAD_TOP_M;
+            image.has_return(index).then(|| match is_road() {
+                true => Surface::Road,
+                false => Surface::Rest,
+            })
+        };
+        let surfaces = (0..image.ranges.len()).into_par_iter().map(surface);
+        Self {
+            image,
+            surfaces: surfaces.collect(),
+        }
+    }
+
+    /// Samples about `count` beams evenly, at most `road_share` of them on the road; neighbours in the list are neighbours in space.
+    ///
+    /// The pixel of a column c is chosen if frac(c φ + u) is less than the requested share of the returns on its kind of surface,
+    /// with the golden ratio φ, whose multiples are spread most evenly, and a random u for each row. Whether a pixel is chosen
+    /// hardly depends on the others, so that almost equal scans give almost equal samples.
+    pub fn choose(&self, count: usize, road_share: f64, rng: &mut impl Rng) -> Vec<Beam> {
+        const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
+        let number_of = |kind| self.surfaces.iter().filter(|it| **it == Some(kind)).count();
+        let (road, rest) = (number_of(Surface::Road), number_of(Surface::Rest));
+        let largest = (road_share * count as f64).round() as usize;
+        let of_road = (count * road / (road + rest).max(1)).min(largest);
+        let share = |count: usize, all: usize| count as f64 / all.max(1) as f64;
+        let (road_share, rest_share) = (share(of_road, road), share(count - of_road, rest));
+
+        let LidarModel { width, height, .. } = self.image.model;
+        // Of all rows, so that the numbers that are drawn afterwards do not depend on the scan.
+        let mut offsets = || (0..height).map(|_| rng.random()).collect::<Vec<f64>>();
+        let (road_offsets, rest_offsets) = (offsets(), offsets());
+        let turns: Vec<f64> = (0..width)
+            .map(|column| (column as f64 * GOLDEN_RATIO).fract())
+            .collect();
+        let mut chosen = Vec::new();
+        for row in 0..height {
+            let pixels = row * width..(row + 1) * width;
+            let of_row = self.surfaces[pixels.clone()].iter().zip(&turns);
+            for (pixel, (surface, turn)) in pixels.zip(of_row) {
+                let (offset, share) = match surface {
+                    None => continue,
+                    Some(Surface::Road) => (road_offsets[row], road_share),
+                    Some(Surface::Rest) => (rest_offsets[row], rest_share),
+                };
+                let sum = turn + offset;
+                let fraction = if sum < 1.0 { sum } else { sum - 1.0 };
+                if fraction < share {
+                    chosen.extend(self.image.beam(pixel));
+                }
+            }
+        }
+        let directions: Vec<Vec3> = chosen.iter().map(|beam| beam.direction).collect();
+        let order = coherent_order(&directions).into_iter();
+        order.map(|beam| chosen[beam as usize]).collect()
+    }
 }
 
 /// Returns a few thousand points near the car, most of them on the road, for
@@ -384,6 +424,36 @@ mod tests {
             };
             assert!(beams.iter().filter(in_quarter).count() > 100);
         }
+    }
+
+    #[test]
+    fn a_beam_is_chosen_by_its_column_and_the_number_of_its_row() {
+        let world = TestWorld::street();
+        let image = world.scan(&world.pose_at(0.0, 0.0, 0.0));
+        let returns = ClassifiedReturns::of(&image, &SensorAttitude::default());
+        let [mut rng, mut same] = [3; 2].map(StdRng::seed_from_u64);
+        let chosen = returns.choose(1000, 0.2, &mut rng);
+        let LidarModel { width, height, .. } = image.model;
+        let offsets: Vec<f64> = (0..2 * height).map(|_| same.random()).collect();
+        for (kind, count, offsets) in [
+            (Surface::Road, 200.0, &offsets[..height]),
+            (Surface::Rest, 800.0, &offsets[height..]),
+        ] {
+            let of_kind = |pixel: &usize| returns.surfaces[*pixel] == Some(kind);
+            let all = (0..width * height).filter(of_kind);
+            let share = count / all.clone().count() as f64;
+            let golden = 0.5 * (1.0 + 5.0_f64.sqrt());
+            let expected = all.filter(|pixel| {
+                let column = (pixel % width) as f64;
+                (column * golden + offsets[pixel / width]).fract() < share
+            });
+            for pixel in expected {
+                assert!(chosen.contains(&image.beam(pixel).unwrap()), "{pixel}");
+            }
+        }
+        let directions: Vec<Vec3> = chosen.iter().map(|beam| beam.direction).collect();
+        let order = coherent_order(&directions);
+        assert!(order.is_sorted());
     }
 
     #[test]

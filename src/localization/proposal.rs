@@ -47,9 +47,7 @@ pub struct ProposalConfig {
     /// the sweep.
     #[default(2400)]
     pub compared_beams: usize,
-    /// Registration of the scan with the map. The last step is so small that the estimate does not depend on whether
-    /// there is one more.
-    #[default(RegistrationConfig { tolerance_m: 1e-4, ..RegistrationConfig::default() })]
+    /// Registration of the scan with the map.
     pub registration: RegistrationConfig,
 }
 

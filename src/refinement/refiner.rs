@@ -16,7 +16,7 @@ use super::wide_search::{self, WideSearchConfig};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
 use crate::map::SensorAttitude;
-use crate::registration::{RegistrationConfig, RegistrationResult, keep, register_informative};
+use crate::registration::{Linearized, RegistrationConfig, RegistrationResult};
 use crate::rendering::RenderError;
 use crate::validation::{
     InvalidValue, Validate, in_range, nested, not_negative, positive, require,
@@ -221,9 +221,10 @@ pub fn refine_frame(
         }
         _ => {}
     }
-    let finished = match config.method {
+    let registered = match config.method {
         Method::GaussNewton | Method::Both => finish(objective, &mut frame, config)?,
-        Method::None | Method::Swarm => None,
+        Method::Swarm => linearized(objective, &frame, config)?.kept(),
+        Method::None => None,
     };
     let patch = objective
         .ground
@@ -233,11 +234,6 @@ pub fn refine_frame(
         frame.level_m = Some(patch.height_m);
     }
     if config.method != Method::None {
-        let (renderer, beams) = (objective.renderer, objective.registered);
-        let registered = match finished {
-            Some(registered) => Some(registered),
-            None => keep(renderer, beams, &frame.map_from_lidar, &config.gauss_newton)?,
-        };
         let covariance = registered.map(|registered| registered.planar_covariance());
         frame.covariance = covariance.unwrap_or_else(undetermined) + config.gauss_newton.of_map();
     }
@@ -310,21 +306,31 @@ fn pose_of(&[x, y, heading_rad]: &[f64; 3]) -> Pose2 {
     Pose2::new(nalgebra::Vector2::new(x, y), heading_rad)
 }
 
-/// Runs Gauss-Newton; `None` where it did not lower the objective.
+/// The beams to be registered at the pose of a frame.
+fn linearized<'a>(
+    objective: &FrameObjective<'a>,
+    frame: &RefinedFrame,
+    config: &'a FrameRefinementConfig,
+) -> Result<Linearized<'a>, RenderError> {
+    let (renderer, beams) = (objective.renderer, objective.registered);
+    let pose = &frame.map_from_lidar;
+    Linearized::at(renderer, beams, pose, &config.gauss_newton)
+}
+
+/// Runs Gauss-Newton; the pose is kept where that does not lower the objective. `None` if the beams do not determine the pose.
 fn finish(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
     config: &FrameRefinementConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
-    let (renderer, beams) = (objective.renderer, objective.registered);
-    let start = &frame.map_from_lidar;
-    let registered = register_informative(renderer, beams, start, &config.gauss_newton)?;
-    let Some(registered) = registered else {
-        return Ok(None);
+    let start = linearized(objective, frame, config)?;
+    let kept = start.kept();
+    let Some(registered) = start.registered()? else {
+        return Ok(kept);
     };
     let cost_m = objective.costs_in_space(&[registered.map_from_lidar])?[0];
     if cost_m > frame.cost_after_m {
-        return Ok(None);
+        return Ok(kept);
     }
     frame.map_from_lidar = registered.map_from_lidar;
     frame.pose = pose2_from_pose3(&registered.map_from_lidar);
@@ -341,7 +347,7 @@ mod tests {
     use crate::geometry::Vec3;
     use crate::lidar::{LidarModel, RangeImage};
     use crate::map::world_for_tests::TestWorld;
-    use crate::registration::register;
+    use crate::registration::{register, register_informative};
     use crate::rendering::{RangeDifference, RangeRenderer, SurfaceHit};
 
     fn refine(method: Method, off: &Pose2, seed: u64) -> (RefinedFrame, Pose2) {
@@ -402,7 +408,9 @@ mod tests {
         let beams: Vec<Beam> = world.scan(&truth).beams().step_by(5).collect();
         let objective = world.objective(&beams);
         let covariance = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, 0.04));
-        let config = FrameRefinementConfig::default();
+        // A narrow kernel has a narrow basin.
+        let mut config = FrameRefinementConfig::default();
+        config.gauss_newton.kernel_m = 0.03;
         let error_m = |[x, y, turn_rad]: [f64; 3], distance: Distance<'_>| {
             let estimate = truth * Pose2::new(Vector2::new(x, y), turn_rad);
             let mut rng = StdRng::seed_from_u64(1);
@@ -418,7 +426,8 @@ mod tests {
                 .take_while(|off_m| error_m([0.8 * off_m, -0.6 * off_m, 0.02], distance) < 0.02);
             found.last().unwrap_or(0.0)
         };
-        assert!(reach_m(Distance::InBasin) < reach_m(Distance::Near));
+        let (in_basin_m, near_m) = (reach_m(Distance::InBasin), reach_m(Distance::Near));
+        assert!(near_m > in_basin_m.max(0.45), "{in_basin_m} {near_m}");
         assert!(error_m([2.0, -1.5, 0.4], Distance::Far(&surfaces)) < 0.02);
     }
 
@@ -606,8 +615,8 @@ mod tests {
         let frame = frame.unwrap().unwrap();
         assert_eq!(frame.pose, truth);
         let kept = &frame.map_from_lidar;
-        let expected = keep(&renderer, &beams, kept, &config.gauss_newton);
-        let expected = expected.unwrap().unwrap().planar_covariance();
+        let there = Linearized::at(&renderer, &beams, kept, &config.gauss_newton).unwrap();
+        let expected = there.kept().unwrap().planar_covariance();
         let expected = expected + config.gauss_newton.of_map();
         assert_eq!(frame.covariance, expected);
     }

@@ -25,7 +25,9 @@ use super::upright::UprightSurfaces;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose3_from_pose2};
 use crate::ground::GroundConfig;
 use crate::lidar::{Beam, Motion, RangeImage, Scan};
-use crate::localization::observation::{ObservationConfig, agreement, choose_beams, ranges_along};
+use crate::localization::observation::{
+    ClassifiedReturns, ObservationConfig, agreement, ranges_along,
+};
 use crate::localization::{Estimate, ScanPreparation, State, TrackingLossConfig};
 use crate::map::{GroundPatch, Map, MapError, SensorAttitude};
 use crate::random::{Generator, stream};
@@ -516,7 +518,8 @@ impl TrajectoryRefiner {
     ) -> Result<Option<Comparison>, RefinerError> {
         let observation = &self.config.observation;
         let attitude = &frame.attitude;
-        let mut choose = |count| choose_beams(image, count, observation.road_share, attitude, rng);
+        let returns = ClassifiedReturns::of(image, attitude);
+        let mut choose = |count| returns.choose(count, observation.road_share, rng);
         let beams = choose(observation.beams);
         let registered = choose(self.config.refinement.registered_beams);
         let mut objective = FrameObjective {

@@ -8,7 +8,7 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 
 /// Settings of the registration.
 ///
-/// Defaults: our own values; from 1.5 degrees away it takes up to ten iterations. `docs/method.md`, Thresholds, has what half and
+/// Defaults: our own values. `docs/method.md`, Thresholds, has what half and
 /// twice of the kernel, the sectors and the error of the map change on four sensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]

@@ -8,7 +8,8 @@
 //! ```
 //!
 //! Each iteration casts one ray per beam; the hit is the correspondence of the return (projective
-//! association), and the plane of its triangle gives the point-to-plane residual.
+//! association), and the plane of its triangle gives the point-to-plane residual. Its step minimizes the robust cost of the
+//! linearized residuals.
 //!
 //! Neighboring returns hit the same surface and share its map error, so their residuals are
 //! correlated, and only sectors of the azimuth are taken as independent: the covariance is that of the jackknife, by the
@@ -44,6 +45,9 @@ use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
 
 /// Tolerance of a registration that another one continues [m].
 const COARSE_TOLERANCE_M: f64 = 0.01;
+
+/// Number of beams that [`approach`] registers.
+const COARSE_BEAMS: usize = 2400;
 
 /// A registered pose with its covariance.
 #[derive(Clone, Debug, PartialEq)]
@@ -92,20 +96,15 @@ fn descend(
     mut residuals: Vec<Residual>,
     config: &RegistrationConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
-    /// Lever of rotations [m].
-    const LEVER_M: f64 = 10.0;
     let mut iterations = 0;
     loop {
-        let Some(equations) = Equations::new(&residuals, config) else {
+        let Some(equations) = Equations::minimal(&residuals, config) else {
             return Ok(None);
         };
         let step = equations.determined_step();
         pose *= exponential(&step);
         iterations += 1;
-        let shift_m = step.fixed_rows::<3>(0).norm();
-        let turn_rad = step.fixed_rows::<3>(3).norm();
-        let has_converged = shift_m + LEVER_M * turn_rad < config.tolerance_m;
-        if has_converged || iterations >= config.iterations {
+        if length_m(&step) < config.tolerance_m || iterations >= config.iterations {
             let covariance = equations.covariance();
             return Ok(covariance.map(|covariance| RegistrationResult {
                 map_from_lidar: pose,
@@ -117,58 +116,119 @@ fn descend(
     }
 }
 
-/// A pose that stays where it is, whose covariance contains the square of the step that it does not take; `None` if the beams
-/// do not determine it.
-pub(crate) fn keep(
-    renderer: &dyn RangeRenderer,
-    beams: &[Beam],
-    map_from_lidar: &Pose3,
-    config: &RegistrationConfig,
-) -> Result<Option<RegistrationResult>, RenderError> {
-    let residuals = linearize(renderer, beams, map_from_lidar, config)?;
-    let kept = |equations: Equations| {
-        let step = equations.determined_step();
-        Some(RegistrationResult {
-            map_from_lidar: *map_from_lidar,
-            covariance: equations.covariance()? + step * step.transpose(),
-            iterations: 0,
-        })
-    };
-    Ok(Equations::new(&residuals, config).and_then(kept))
+/// Length of a step; rotations have a lever of ten metres.
+fn length_m(step: &Vector6<f64>) -> f64 {
+    const LEVER_M: f64 = 10.0;
+    step.fixed_rows::<3>(0).norm() + LEVER_M * step.fixed_rows::<3>(3).norm()
 }
 
-/// Registers beams in two stages: 2,400 of them, then the 4,800 most informative ones, see [`informative::choose`]; fewer
-/// beams in one stage.
-pub(crate) fn register_informative(
+/// Registers some of many beams coarsely: a pose from which [`register_informative`] goes on. It is the initial one for few beams,
+/// and where they do not determine the pose.
+pub(crate) fn approach(
     renderer: &dyn RangeRenderer,
     beams: &[Beam],
     initial: &Pose3,
     config: &RegistrationConfig,
-) -> Result<Option<RegistrationResult>, RenderError> {
-    const COARSE: usize = 2400;
-    const FINE: usize = 4800;
-    if beams.len() <= COARSE {
-        return register(renderer, beams, initial, config);
+) -> Result<Pose3, RenderError> {
+    if beams.len() <= COARSE_BEAMS {
+        return Ok(*initial);
     }
-    let step = beams.len().div_ceil(COARSE);
+    let step = beams.len().div_ceil(COARSE_BEAMS);
     let some: Vec<Beam> = beams.iter().step_by(step).copied().collect();
-    let near = register(
-        renderer,
-        &some,
-        initial,
-        &config.with_tolerance(COARSE_TOLERANCE_M),
-    )?;
-    let near = near.map_or(*initial, |near| near.map_from_lidar);
-    let residuals = linearize(renderer, beams, &near, config)?;
-    let residuals = informative::choose(residuals, FINE, config);
-    let chosen: Vec<Beam> = (residuals.iter())
-        .map(|residual| beams[residual.beam])
-        .collect();
-    descend(renderer, &chosen, near, residuals, config)
+    let coarse = config.with_tolerance(COARSE_TOLERANCE_M);
+    let near = register(renderer, &some, initial, &coarse)?;
+    Ok(near.map_or(*initial, |near| near.map_from_lidar))
+}
+
+/// Registers the most informative beams, see [`Linearized::registered`].
+pub(crate) fn register_informative(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    near: &Pose3,
+    config: &RegistrationConfig,
+) -> Result<Option<RegistrationResult>, RenderError> {
+    Linearized::at(renderer, beams, near, config)?.registered()
+}
+
+/// Many beams at a pose near the right one: it can be improved, or kept.
+pub(crate) struct Linearized<'a> {
+    renderer: &'a dyn RangeRenderer,
+    beams: &'a [Beam],
+    map_from_lidar: Pose3,
+    config: &'a RegistrationConfig,
+    residuals: Vec<Residual>,
+}
+
+impl<'a> Linearized<'a> {
+    /// Finds what the beams hit from a pose.
+    pub fn at(
+        renderer: &'a dyn RangeRenderer,
+        beams: &'a [Beam],
+        map_from_lidar: &Pose3,
+        config: &'a RegistrationConfig,
+    ) -> Result<Self, RenderError> {
+        Ok(Self {
+            renderer,
+            beams,
+            map_from_lidar: *map_from_lidar,
+            config,
+            residuals: linearize(renderer, beams, map_from_lidar, config)?,
+        })
+    }
+
+    /// The pose as it is. Its covariance contains the square of the step that it does not take. `None` if the beams do not
+    /// determine the pose.
+    pub fn kept(&self) -> Option<RegistrationResult> {
+        let equations = Equations::new(&self.residuals, &Vector6::zeros(), self.config)?;
+        let step = equations.determined_step();
+        Some(RegistrationResult {
+            map_from_lidar: self.map_from_lidar,
+            covariance: equations.covariance()? + step * step.transpose(),
+            iterations: 0,
+        })
+    }
+
+    /// The pose registered by the 4,800 most informative beams, see [`informative::choose`], or by all if these are no more than
+    /// [`approach`] takes. Where the pose turns out to be farther off, they are chosen after an approach. `None` if they do not
+    /// determine it.
+    pub fn registered(mut self) -> Result<Option<RegistrationResult>, RenderError> {
+        const FINE: usize = 4800;
+        /// Step up to which the right beams are chosen: half of the default scale of the kernel [m].
+        const NEAR_M: f64 = 0.05;
+        let is_near = |equations: Equations| length_m(&equations.determined_step()) <= NEAR_M;
+        if self.beams.len() > COARSE_BEAMS
+            && !Equations::new(&self.residuals, &Vector6::zeros(), self.config).is_some_and(is_near)
+        {
+            let Self {
+                renderer,
+                beams,
+                config,
+                ..
+            } = self;
+            let near = approach(renderer, beams, &self.map_from_lidar, config)?;
+            self = Self::at(renderer, beams, &near, config)?;
+        }
+        let Self {
+            renderer,
+            beams,
+            map_from_lidar,
+            config,
+            residuals,
+        } = self;
+        if beams.len() <= COARSE_BEAMS {
+            return descend(renderer, beams, map_from_lidar, residuals, config);
+        }
+        let residuals = informative::choose(residuals, FINE, config);
+        let chosen: Vec<Beam> = (residuals.iter())
+            .map(|residual| beams[residual.beam])
+            .collect();
+        descend(renderer, &chosen, map_from_lidar, residuals, config)
+    }
 }
 
 /// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second
-/// as configured. A pose that is not accepted ends it; the last accepted one is returned, if any.
+/// as configured. Beams that do not determine the pose are passed over, and a pose that is not accepted ends it; the last accepted
+/// one is returned, if any.
 pub(crate) fn register_coarse_to_fine(
     renderer: &dyn RangeRenderer,
     beams: [&[Beam]; 2],
@@ -183,10 +243,12 @@ pub(crate) fn register_coarse_to_fine(
     };
     let (mut pose, mut result) = (*initial, None);
     for (beams, config) in beams.into_iter().zip([&wide, config]) {
-        let found = register(renderer, beams, &pose, config)?;
-        let Some(found) = found.filter(|found| is_accepted(&found.map_from_lidar)) else {
-            break;
+        let Some(found) = register(renderer, beams, &pose, config)? else {
+            continue;
         };
+        if !is_accepted(&found.map_from_lidar) {
+            break;
+        }
         pose = found.map_from_lidar;
         result = Some(found);
     }
@@ -250,15 +312,41 @@ struct Equations {
 }
 
 impl Equations {
-    /// `None` for too few residuals, or if the information matrix is singular.
-    fn new(residuals: &[Residual], config: &RegistrationConfig) -> Option<Self> {
+    /// The equations whose step has the least robust cost of the linearized residuals, by iteratively reweighted least squares: they
+    /// have the weights of the residuals after the step, or nearly. Weights cost far less than rays.
+    fn minimal(residuals: &[Residual], config: &RegistrationConfig) -> Option<Self> {
+        /// Most rounds.
+        const ROUNDS: usize = 5;
+        /// Change of the step that ends them, in tolerances: they need no rays.
+        const TOLERANCE: f64 = 0.1;
+        let mut before = Vector6::zeros();
+        let mut equations = Self::new(residuals, &before, config)?;
+        for _ in 0..ROUNDS {
+            let step = equations.determined_step();
+            if length_m(&(step - before)) < TOLERANCE * config.tolerance_m {
+                break;
+            }
+            before = step;
+            let Some(reweighted) = Self::new(residuals, &step, config) else {
+                break;
+            };
+            equations = reweighted;
+        }
+        Some(equations)
+    }
+
+    /// Equations with the weights of the linearized residuals after a step. `None` for too few residuals, or if the information
+    /// matrix is singular.
+    fn new(
+        residuals: &[Residual],
+        weighted_after: &Vector6<f64>,
+        config: &RegistrationConfig,
+    ) -> Option<Self> {
         /// Fewer residuals determine no pose.
         const MIN_RESIDUALS: usize = 30;
         if residuals.len() < MIN_RESIDUALS {
             return None;
         }
-        let mut information = Matrix6::zeros();
-        let mut right_side = Vector6::zeros();
         let mut sectors = vec![(Matrix6::zeros(), Vector6::zeros()); config.sectors];
         let (mut squares, mut weights) = (0.0, 0.0);
         let kernel = RobustKernel {
@@ -266,18 +354,25 @@ impl Equations {
         };
         for residual in residuals {
             let jacobian = residual.jacobian;
-            let weight = kernel.weight(residual.value_m);
-            let of_residual = weight * jacobian * jacobian.transpose();
-            information += of_residual;
-            let gradient = weight * residual.value_m * jacobian;
-            right_side -= gradient;
-            let sector = &mut sectors[residual.sector];
-            sector.0 += of_residual;
-            sector.1 += gradient;
-            squares += weight * residual.value_m.powi(2);
+            let after_m = residual.value_m + jacobian.dot(weighted_after);
+            let weight = kernel.weight(after_m);
+            let (of_sector, gradient) = &mut sectors[residual.sector];
+            for column in 0..6 {
+                let factor = weight * jacobian[column];
+                for row in column..6 {
+                    of_sector[(row, column)] += factor * jacobian[row];
+                }
+            }
+            gradient.axpy(weight * residual.value_m, &jacobian, 1.0);
+            squares += weight * after_m.powi(2);
             weights += weight;
         }
-        let step = information.cholesky()?.solve(&right_side);
+        for (of_sector, _) in &mut sectors {
+            of_sector.fill_upper_triangle_with_lower_triangle();
+        }
+        let information: Matrix6<f64> = sectors.iter().map(|(of_sector, _)| of_sector).sum();
+        let gradient: Vector6<f64> = sectors.iter().map(|(_, gradient)| gradient).sum();
+        let step = -information.cholesky()?.solve(&gradient);
         let horizontal = Horizontal::new(&information, weights * config.normal_rad.powi(2))?;
         let is_finite = step.iter().all(|value| value.is_finite());
         is_finite.then_some(Self {
@@ -366,12 +461,64 @@ mod tests {
         let config = RegistrationConfig::default();
         let all: Vec<Beam> = world.scan(&truth).beams().collect();
         assert!(all.len() > 6000, "{}", all.len());
-        let found = register_informative(&world, &all, &off, &config);
+        let near = approach(&world, &all, &off, &config).unwrap();
+        let found = register_informative(&world, &all, &near, &config);
         let found = found.unwrap().unwrap().map_from_lidar;
         assert_relative_eq!(found, lift(&world, &truth), epsilon = 3e-3);
         let few: Vec<Beam> = all.into_iter().step_by(11).collect();
+        assert_eq!(approach(&world, &few, &off, &config).unwrap(), off);
         let found = register_informative(&world, &few, &off, &config).unwrap();
         assert_eq!(found, register(&world, &few, &off, &config).unwrap());
+    }
+
+    #[test]
+    fn a_step_has_the_least_robust_cost_of_the_linearized_residuals() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(5.0, 0.3, 0.1);
+        let off = truth * Pose2::new(Vector2::new(0.06, -0.05), 0.004);
+        let mut beams = beams(&world, &truth);
+        // A fifth of the beams end 0.2 m too early.
+        (beams.iter_mut().step_by(5)).for_each(|beam| beam.range_m -= 0.2);
+        let config = RegistrationConfig::default();
+        let residuals = linearize(&world, &beams, &lift(&world, &off), &config).unwrap();
+        let kernel = RobustKernel {
+            scale_m: config.kernel_m,
+        };
+        let cost = |step: &Vector6<f64>| -> f64 {
+            let after_m = |it: &Residual| it.value_m + it.jacobian.dot(step);
+            residuals.iter().map(|it| kernel.cost(after_m(it))).sum()
+        };
+        let once = Equations::new(&residuals, &Vector6::zeros(), &config).unwrap();
+        let least = Equations::minimal(&residuals, &config).unwrap().step;
+        assert!(cost(&least) < cost(&once.step), "{least} {}", once.step);
+        for component in 0..6 {
+            for sign in [-1.0, 1.0] {
+                let mut beside = least;
+                beside[component] += sign * 2e-3;
+                assert!(cost(&beside) > cost(&least), "{component} {sign}");
+            }
+        }
+    }
+
+    #[test]
+    fn beams_are_chosen_after_an_approach_where_the_pose_is_farther_off() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(5.0, 0.3, 0.1);
+        let all: Vec<Beam> = world.scan(&truth).beams().collect();
+        let config = RegistrationConfig::default();
+        let off = lift(
+            &world,
+            &(truth * Pose2::new(Vector2::new(0.2, -0.1), 0.009)),
+        );
+        let found = register_informative(&world, &all, &off, &config).unwrap();
+        let near = approach(&world, &all, &off, &config).unwrap();
+        let expected = register_informative(&world, &all, &near, &config).unwrap();
+        assert_eq!(found, expected);
+        assert_relative_eq!(
+            found.unwrap().map_from_lidar,
+            lift(&world, &truth),
+            epsilon = 3e-3
+        );
     }
 
     #[test]

@@ -11,6 +11,7 @@ mod order;
 pub(crate) mod selection;
 
 pub use backend::{Backend, RenderingMethod};
+pub(crate) use order::coherent_order;
 
 pub(crate) use cpu::CpuRenderer;
 

@@ -30,7 +30,7 @@ pub(super) fn pixel_order(model: &LidarModel) -> Vec<u32> {
 }
 
 /// Directions along a Z-order curve over azimuth and elevation (Morton 1966).
-pub(super) fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
+pub(crate) fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
     let mut keyed: Vec<(u64, u32)> = directions
         .iter()
         .enumerate()

@@ -10,14 +10,14 @@ use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::observation::{
-    above_road, agreement, agrees_better, choose_beams, costs_of_scan, ranges_along,
+    ClassifiedReturns, above_road, agreement, agrees_better, costs_of_scan, ranges_along,
 };
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::is_same;
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::SensorAttitude;
-use crate::registration::{RegistrationConfig, register, register_informative};
+use crate::registration::{RegistrationConfig, approach, register, register_informative};
 use crate::rendering::RenderError;
 
 /// Distance from the prior beyond which a registration is rejected (standard deviations): of normal errors of x, y and heading,
@@ -56,8 +56,8 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Option<Pose3>, RenderError> {
-        /// Tolerance [m]: it changes the motion during the sweep by about a millimetre.
-        const TOLERANCE_M: f64 = 1e-3;
+        /// Tolerance [m]: a step is about a fifth of the one before, so that a millimetre of the motion during the sweep is left.
+        const TOLERANCE_M: f64 = 5e-3;
         let config = &self.config.proposal;
         let pending = self.pending.unwrap_or_default().motion;
         let predicted = self.particles.mean() * pending * self.increment(odometry);
@@ -66,7 +66,7 @@ impl ParticleFilter {
             return Ok(None);
         };
         let count = config.compared_beams;
-        let beams = choose_beams(scan, count, config.road_share, attitude, rng);
+        let beams = ClassifiedReturns::of(scan, attitude).choose(count, config.road_share, rng);
         let start = patch.lift(&predicted, attitude);
         let registration = self.registration().with_tolerance(TOLERANCE_M);
         let found = register(&*self.map.renderer, &beams, &start, &registration)?;
@@ -121,7 +121,8 @@ impl ParticleFilter {
         let Some(patch) = self.patch_at(&mean)?.or(self.patch) else {
             return Ok(None);
         };
-        let mut choose = |count| choose_beams(scan, count, config.road_share, attitude, rng);
+        let returns = ClassifiedReturns::of(scan, attitude);
+        let mut choose = |count| returns.choose(count, config.road_share, rng);
         let (registered, beams) = (choose(config.beams), choose(config.compared_beams));
         let Some(prior) = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)))
         else {
@@ -132,15 +133,17 @@ impl ParticleFilter {
         let renderer = &*self.map.renderer;
         let registration = self.registration();
         let start = match basin {
-            Basin::Pose { start } => start
-                .filter(|start| is_plausible(&pose2_from_pose3(start)))
-                .unwrap_or(predicted),
+            Basin::Pose { start } => start.filter(|start| is_plausible(&pose2_from_pose3(start))),
             Basin::Place => {
                 let step = registered.len().div_ceil(PLACE_BEAMS).max(1);
                 let some: Vec<Beam> = registered.iter().step_by(step).copied().collect();
                 let found = self.registered_in_place(&some, &predicted, &mean)?;
-                found.map_or(predicted, |found| found.map_from_lidar)
+                found.map(|found| found.map_from_lidar)
             }
+        };
+        let start = match start {
+            Some(registered) => registered,
+            None => approach(renderer, &registered, &predicted, &registration)?,
         };
         let Some(found) = register_informative(renderer, &registered, &start, &registration)?
         else {
@@ -256,10 +259,11 @@ mod tests {
         let config = &filter.config.proposal;
         let [mut rng, mut same] = [2; 2].map(StdRng::seed_from_u64);
         let (count, road_share) = (config.beams, config.road_share);
-        let beams = choose_beams(&scan, count, road_share, &attitude, &mut same);
+        let beams = ClassifiedReturns::of(&scan, &attitude).choose(count, road_share, &mut same);
         let start = filter.patch_at(&mean).unwrap().unwrap();
         let start = start.lift(&mean, &attitude);
         let registration = &config.registration;
+        let start = approach(&world, &beams, &start, registration).unwrap();
         let found = register_informative(&world, &beams, &start, registration).unwrap();
         let found = found.unwrap();
         let measured = regular(&found.planar_covariance()).try_inverse().unwrap();
@@ -297,10 +301,11 @@ mod tests {
             found.unwrap().map_or(f64::INFINITY, off)
         };
         // The prediction is off by more than the gates of the registration.
-        let aside = truth * Pose2::translation(0.0, 1.5);
+        let aside = truth * Pose2::translation(0.0, 3.0);
         assert!(error_m(aside, 1.0, at_truth) < 0.01);
-        assert!(error_m(aside, 1.0, None) > 0.1);
-        // The given start is off, by 15 standard deviations.
+        let without_m = error_m(aside, 1.0, None);
+        assert!(without_m > 0.1, "{without_m}");
+        // The given start is off, by 30 standard deviations.
         let off = world.ground.lift(&aside, &attitude).unwrap();
         assert!(error_m(truth, 0.1, off) < 0.01);
     }
