@@ -223,7 +223,7 @@ pub fn refine_frame(
     }
     let registered = match config.method {
         Method::GaussNewton | Method::Both => finish(objective, &mut frame, config)?,
-        Method::Swarm => linearized(objective, &frame, config)?.kept(),
+        Method::Swarm => linearized(objective, &frame, config)?.kept()?,
         Method::None => None,
     };
     let patch = objective
@@ -324,13 +324,12 @@ fn finish(
     config: &FrameRefinementConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
     let start = linearized(objective, frame, config)?;
-    let kept = start.kept();
     let Some(registered) = start.registered()? else {
-        return Ok(kept);
+        return start.kept();
     };
     let cost_m = objective.costs_in_space(&[registered.map_from_lidar])?[0];
     if cost_m > frame.cost_after_m {
-        return Ok(kept);
+        return start.kept();
     }
     frame.map_from_lidar = registered.map_from_lidar;
     frame.pose = pose2_from_pose3(&registered.map_from_lidar);
@@ -616,7 +615,7 @@ mod tests {
         assert_eq!(frame.pose, truth);
         let kept = &frame.map_from_lidar;
         let there = Linearized::at(&renderer, &beams, kept, &config.gauss_newton).unwrap();
-        let expected = there.kept().unwrap().planar_covariance();
+        let expected = there.kept().unwrap().unwrap().planar_covariance();
         let expected = expected + config.gauss_newton.of_map();
         assert_eq!(frame.covariance, expected);
     }

@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use crate::geometry::RobustKernel;
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Settings of the registration.
@@ -47,6 +48,13 @@ impl RegistrationConfig {
         const LEVER_M: f64 = 30.0;
         let deviations = Vector3::new(1.0, 1.0, 1.0 / LEVER_M) * self.map_error_m;
         Matrix3::from_diagonal(&deviations.component_mul(&deviations))
+    }
+
+    /// Kernel of the distances to the surfaces.
+    pub(super) fn kernel(&self) -> RobustKernel {
+        RobustKernel {
+            scale_m: self.kernel_m,
+        }
     }
 
     /// The settings with a tolerance of at least that [m], for a pose that another registration continues.

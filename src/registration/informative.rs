@@ -18,27 +18,26 @@ use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 use super::config::RegistrationConfig;
 use super::information::{Horizontal, Residual};
-use crate::geometry::RobustKernel;
 
 /// The residuals of about `count` beams in their order; all of them if these are fewer, or do not determine the pose.
 pub(super) fn choose(
-    mut residuals: Vec<Residual>,
+    residuals: &[Residual],
     count: usize,
     config: &RegistrationConfig,
 ) -> Vec<Residual> {
     const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
     let shares = (residuals.len() > count)
-        .then(|| shares(&residuals, count, config))
+        .then(|| shares(residuals, count, config))
         .flatten();
-    if let Some(shares) = shares {
-        let mut shares = shares.into_iter();
-        // Multiples of the golden ratio are spread most evenly, and whether a beam is drawn hardly depends on the others.
-        residuals.retain(|residual| {
-            let share = shares.next().unwrap_or_default();
-            (residual.beam as f64 * GOLDEN_RATIO).fract() < share
-        });
-    }
-    residuals
+    let Some(shares) = shares else {
+        return residuals.to_vec();
+    };
+    // Multiples of the golden ratio are spread most evenly, and whether a beam is drawn hardly depends on the others.
+    let is_drawn = |(residual, share): &(&Residual, f64)| {
+        (residual.beam as f64 * GOLDEN_RATIO).fract() < *share
+    };
+    let drawn = residuals.iter().zip(shares).filter(is_drawn);
+    drawn.map(|(residual, _)| residual.clone()).collect()
 }
 
 /// Probabilities of the residuals, whose sum is about `count`; `None` if all of them do not determine the pose.
@@ -59,9 +58,7 @@ fn shares(residuals: &[Residual], count: usize, config: &RegistrationConfig) -> 
 
 /// Leverage of each residual on position and heading; `None` if all of them do not determine the pose.
 fn leverages(residuals: &[Residual], config: &RegistrationConfig) -> Option<Vec<f64>> {
-    let kernel = RobustKernel {
-        scale_m: config.kernel_m,
-    };
+    let kernel = config.kernel();
     let mut information = Matrix6::zeros();
     let mut weights = 0.0;
     for residual in residuals {
@@ -137,7 +134,7 @@ mod tests {
 
     #[test]
     fn all_that_few_beams_show_is_kept_and_the_rest_is_drawn_uniformly() {
-        let chosen = beams_of(&choose(street(0.0), 3000, &exact_normals()));
+        let chosen = beams_of(&choose(&street(0.0), 3000, &exact_normals()));
         assert!((2900..=3100).contains(&chosen.len()), "{}", chosen.len());
         assert!(chosen.is_sorted());
         // All 60 poles, where every other beam would have had 30.
@@ -159,7 +156,7 @@ mod tests {
     #[test]
     fn few_residuals_are_all_taken() {
         let few: Vec<Residual> = street(0.0).into_iter().step_by(3).collect();
-        let chosen = beams_of(&choose(few, 3000, &RegistrationConfig::default()));
+        let chosen = beams_of(&choose(&few, 3000, &RegistrationConfig::default()));
         assert!(chosen.iter().copied().eq((0..6000).step_by(3)));
     }
 }
