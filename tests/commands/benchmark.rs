@@ -27,10 +27,24 @@ path: [{length_m: 45, turn_deg: 60, grade_percent: 3}]
 scanner: {beams: 32, azimuth_steps: 720}
 ";
 
+/// Two drives.
+static SIMULATED: LazyLock<TempDir> = LazyLock::new(|| {
+    let folder = shared_folder();
+    simulate_two_drives(folder.path(), STREET);
+    folder
+});
+
+/// A copy of [`SIMULATED`].
+fn simulated() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    copy_into(SIMULATED.path(), folder.path());
+    folder
+}
+
 /// Two drives and their finished benchmark, of which other tests take the stages of the first drive.
 static FINISHED: LazyLock<TempDir> = LazyLock::new(|| {
     let folder = shared_folder();
-    simulate_two_drives(folder.path(), STREET);
+    copy_into(SIMULATED.path(), folder.path());
     let printed = benchmark(folder.path()).succeeds().stdout;
     assert!(printed.contains("benchmark.html"), "{printed}");
     folder
@@ -108,9 +122,8 @@ fn two_sessions_give_all_figures_and_a_second_run_takes_what_is_finished() {
 
 #[test]
 fn one_session_without_a_truth_is_divided_and_says_that_it_has_no_errors() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = simulated();
     let folder = folder.path();
-    simulate_two_drives(folder, STREET);
     let drive = folder.join("street/drive_1");
     for name in ["poses.txt", "calib.txt"] {
         fs::remove_file(drive.join(name)).unwrap();
@@ -186,9 +199,8 @@ fn a_truth_on_a_straight_line_leaves_out_the_errors_after_alignment() {
 
 #[test]
 fn another_error_of_the_evaluation_after_alignment_leaves_the_stage_unfinished() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = simulated();
     let folder = folder.path();
-    simulate_two_drives(folder, STREET);
     // Without a truth of the first session, nothing else is evaluated with this key.
     for name in ["poses.txt", "calib.txt"] {
         fs::remove_file(folder.join("street/drive_1").join(name)).unwrap();
@@ -248,9 +260,8 @@ fn finished_stages(folder: &Path) -> BTreeMap<String, serde_json::Value> {
 fn a_benchmark_that_is_ended_between_its_stages_resumes() {
     /// Time limit for a program that hangs.
     const TIMEOUT: Duration = Duration::from_secs(300);
-    let folder = tempfile::tempdir().unwrap();
+    let folder = simulated();
     let folder = folder.path();
-    simulate_two_drives(folder, STREET);
     // The program waits for this scan twice: where it opens the sessions, and in the third stage.
     let scan = folder.join("street/drive_2/velodyne/000020.bin");
     let bytes = replace_by_pipe(&scan);
@@ -302,9 +313,8 @@ fn a_benchmark_that_is_ended_between_its_stages_resumes() {
 
 #[test]
 fn a_key_that_no_stage_has_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = simulated();
     let folder = folder.path();
-    simulate_two_drives(folder, STREET);
     let call = benchmark(folder).set("num_partikles", "500");
     call.fails_with(&["num_partikles", "localize"]);
     assert!(!folder.join("results/benchmark/stages").exists());
