@@ -147,7 +147,7 @@ pub fn choose_beams(
     attitude: &SensorAttitude,
     rng: &mut impl Rng,
 ) -> Vec<Beam> {
-    ClassifiedReturns::of(image, attitude).choose(count, road_share, rng)
+    ClassifiedReturns::new(image, attitude).choose(count, road_share, rng)
 }
 
 /// The returns of a range image, on the road and above it.
@@ -165,16 +165,19 @@ enum Surface {
 }
 
 impl<'a> ClassifiedReturns<'a> {
-    /// Tells the road from the rest.
-    pub fn of(image: &'a RangeImage, attitude: &SensorAttitude) -> Self {
+    /// Classifies the returns.
+    pub fn new(image: &'a RangeImage, attitude: &SensorAttitude) -> Self {
         /// Points below this height above the plane of the road are on the road [m].
         const ROAD_TOP_M: f32 = 0.3;
         let road_from_lidar = Rigid3f::from(&attitude.road_from_lidar());
         let surface = |index: usize| {
             let is_road = || road_from_lidar.apply(image.points[index]).z < ROAD_TOP_M;
-            image.has_return(index).then(|| match is_road() {
-                true => Surface::Road,
-                false => Surface::Rest,
+            image.has_return(index).then(|| {
+                if is_road() {
+                    Surface::Road
+                } else {
+                    Surface::Rest
+                }
             })
         };
         let surfaces = (0..image.ranges.len()).into_par_iter().map(surface);
@@ -430,11 +433,12 @@ mod tests {
     fn a_beam_is_chosen_by_its_column_and_the_number_of_its_row() {
         let world = TestWorld::street();
         let image = world.scan(&world.pose_at(0.0, 0.0, 0.0));
-        let returns = ClassifiedReturns::of(&image, &SensorAttitude::default());
+        let returns = ClassifiedReturns::new(&image, &SensorAttitude::default());
         let [mut rng, mut same] = [3; 2].map(StdRng::seed_from_u64);
         let chosen = returns.choose(1000, 0.2, &mut rng);
         let LidarModel { width, height, .. } = image.model;
         let offsets: Vec<f64> = (0..2 * height).map(|_| same.random()).collect();
+        let mut expected_count = 0;
         for (kind, count, offsets) in [
             (Surface::Road, 200.0, &offsets[..height]),
             (Surface::Rest, 800.0, &offsets[height..]),
@@ -449,8 +453,10 @@ mod tests {
             });
             for pixel in expected {
                 assert!(chosen.contains(&image.beam(pixel).unwrap()), "{pixel}");
+                expected_count += 1;
             }
         }
+        assert_eq!(chosen.len(), expected_count);
         let directions: Vec<Vec3> = chosen.iter().map(|beam| beam.direction).collect();
         let order = coherent_order(&directions);
         assert!(order.is_sorted());

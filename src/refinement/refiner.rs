@@ -314,7 +314,7 @@ fn linearized<'a>(
 ) -> Result<Linearized<'a>, RenderError> {
     let (renderer, beams) = (objective.renderer, objective.registered);
     let pose = &frame.map_from_lidar;
-    Linearized::at(renderer, beams, pose, &config.gauss_newton)
+    Linearized::new(renderer, beams, pose, &config.gauss_newton)
 }
 
 /// Runs Gauss-Newton; the pose is kept where that does not lower the objective. `None` if the beams do not determine the pose.
@@ -614,7 +614,7 @@ mod tests {
         let frame = frame.unwrap().unwrap();
         assert_eq!(frame.pose, truth);
         let kept = &frame.map_from_lidar;
-        let there = Linearized::at(&renderer, &beams, kept, &config.gauss_newton).unwrap();
+        let there = Linearized::new(&renderer, &beams, kept, &config.gauss_newton).unwrap();
         let expected = there.kept().unwrap().unwrap().planar_covariance();
         let expected = expected + config.gauss_newton.of_map();
         assert_eq!(frame.covariance, expected);

@@ -518,7 +518,7 @@ impl TrajectoryRefiner {
     ) -> Result<Option<Comparison>, RefinerError> {
         let observation = &self.config.observation;
         let attitude = &frame.attitude;
-        let returns = ClassifiedReturns::of(image, attitude);
+        let returns = ClassifiedReturns::new(image, attitude);
         let mut choose = |count| returns.choose(count, observation.road_share, rng);
         let beams = choose(observation.beams);
         let registered = choose(self.config.refinement.registered_beams);

@@ -7,7 +7,7 @@ use super::information::{Horizontal, Residual};
 
 /// Normal equations of the residuals at a pose, with their solution.
 pub(super) struct Equations {
-    pub information: Matrix6<f64>,
+    information: Matrix6<f64>,
     /// Parts of the sectors of the information and of the gradient.
     sectors: Vec<(Matrix6<f64>, Vector6<f64>)>,
     /// Variance of the residuals [m²].

@@ -3,15 +3,17 @@
 //! Normals of the map have noise, and along a tunnel it would count as information. Of each horizontal direction, W σₙ² is taken off
 //! for a sum W of weights (errors in variables: Fuller, *Measurement Error Models*, 1987), and where that is much of it, the noise may
 //! be larger: a guard rail that few scans have mapped has ripples, in the pattern of those scans. What the linearized residuals expect
-//! is compared with what is observed: the cost with rays that are cast anew from both sides of the pose. Ripples make it no higher.
+//! is compared with what is observed: the cost of rays that are cast anew from both sides of the pose. Ripples make it no higher.
 //!
 //! ```text
-//! q = Σ ρ(rᵢ(±δ)) − ρ(rᵢ(0))  /  Σ ρ(rᵢ(0) ± Jᵢ δ) − ρ(rᵢ(0))  in 0..1        kept: q · found − W σₙ²
+//! q = Σ [ρ(rᵢ(±d)) − ρ(rᵢ(0))] / Σ [ρ(rᵢ(0) ± Jᵢ d) − ρ(rᵢ(0))]  in 0..1        kept: q · found − W σₙ²
 //! ```
+//!
+//! with the cost ρ of the kernel and a shift d. Only the covariance is corrected by q, not the step.
 //!
 //! Efron and Hinkley, *Assessing the Accuracy of the Maximum Likelihood Estimator: Observed Versus Expected Fisher Information* (1978).
 
-use nalgebra::{Matrix2, Matrix6, Vector2, Vector6};
+use nalgebra::{Matrix2, Matrix6, Matrix6x2, Vector2, Vector6};
 
 use crate::geometry::RobustKernel;
 
@@ -38,6 +40,8 @@ pub(super) struct Horizontal {
     kept: Vector2<f64>,
     /// The part of each that is not information.
     noise: f64,
+    /// Covariance of all components with the horizontal ones, noise included.
+    covariance: Matrix6x2<f64>,
 }
 
 impl Horizontal {
@@ -52,6 +56,7 @@ impl Horizontal {
             found: eigen.eigenvalues,
             kept: eigen.eigenvalues.map(|found| kept(found, 1.0, noise)),
             noise,
+            covariance: covariance.fixed_columns::<2>(0).into_owned(),
         })
     }
 
@@ -76,17 +81,15 @@ impl Horizontal {
 
     /// Numbers of the directions of which a tenth or more may be noise, but not all.
     pub fn doubtful(&self) -> impl Iterator<Item = usize> + use<> {
-        /// Least share of the noise, see there.
+        /// Least share of the noise: `docs/method.md`, Thresholds.
         const NOISE_SHARE: f64 = 0.1;
         let (found, noise) = (self.found, self.noise);
         (0..2).filter(move |&axis| (NOISE_SHARE..1.0).contains(&(noise / found[axis])))
     }
 
     /// A unit shift in a direction, in which all other components follow as the residuals want it.
-    pub fn unit_shift(&self, axis: usize, information: &Matrix6<f64>) -> Option<Vector6<f64>> {
-        let covariance = information.try_inverse()?;
-        let direction = self.directions.column(axis) * self.found[axis];
-        Some(covariance.fixed_columns::<2>(0) * direction)
+    pub fn unit_shift(&self, axis: usize) -> Vector6<f64> {
+        self.covariance * (self.directions.column(axis) * self.found[axis])
     }
 
     /// Keeps a share of the information that was found on a direction, less the noise.
@@ -152,10 +155,9 @@ mod tests {
     #[test]
     fn ripples_raise_the_cost_as_far_as_returns_follow_them() {
         const KERNEL: RobustKernel = RobustKernel { scale_m: 0.1 };
-        let shift = |shift_m: f64| 0.05 * shift_m.signum() * Vector6::x();
         for (followed, least, most) in [(0.0, 0.0, 0.05), (0.5, 0.4, 0.6), (1.0, 0.9, 1.0)] {
-            let sides = [-0.05, 0.05].map(|shift_m| (shift(shift_m), wall(shift_m, followed)));
-            let share = observed_share(&wall(0.0, followed), &sides, KERNEL);
+            let side = |shift_m| (shift_m * Vector6::x(), wall(shift_m, followed));
+            let share = observed_share(&wall(0.0, followed), &[-0.05, 0.05].map(side), KERNEL);
             assert!((least..=most).contains(&share), "{followed} {share}");
         }
     }
@@ -177,27 +179,51 @@ mod tests {
         assert_eq!(observed_share(&wall(0.0, 0.0), &[], KERNEL), 0.0);
     }
 
+    /// Independent information along x, and 1000 on all else.
+    fn information(along: f64) -> Matrix6<f64> {
+        let mut information = Matrix6::identity() * 1000.0;
+        information[(0, 0)] = along;
+        information
+    }
+
     #[test]
     fn directions_are_doubtful_where_a_tenth_to_all_of_what_is_found_may_be_noise() {
-        // Information of 9, 11 and 1000 along x, and 1000 across.
         for (along, noise, expected) in [
-            (11.0, 1.0, 0),
             (9.0, 1.0, 1),
+            (11.0, 1.0, 0),
             (1000.0, 1.0, 0),
             (9.0, 10.0, 0),
         ] {
-            let mut information = Matrix6::identity() * 1000.0;
-            information[(0, 0)] = along;
-            let mut horizontal = Horizontal::new(&information, noise).unwrap();
-            let doubtful: Vec<usize> = horizontal.doubtful().collect();
-            assert_eq!(doubtful.len(), expected, "{along}");
-            for axis in doubtful {
-                let shift = horizontal.unit_shift(axis, &information).unwrap();
-                assert!((shift.x.abs() - 1.0).abs() < 1e-9 && shift.norm() < 1.0 + 1e-9);
-                horizontal.observe(axis, 0.5);
-                let corrected = horizontal.corrected(&information);
-                assert!((corrected[(0, 0)] - 3.5).abs() < 1e-9, "{corrected}");
-            }
+            let horizontal = Horizontal::new(&information(along), noise).unwrap();
+            assert_eq!(horizontal.doubtful().count(), expected, "{along} {noise}");
         }
+    }
+
+    #[test]
+    fn of_what_was_found_the_observed_share_is_kept_less_the_noise() {
+        let information = information(9.0);
+        let mut horizontal = Horizontal::new(&information, 1.0).unwrap();
+        let axis = horizontal.doubtful().next().unwrap();
+        horizontal.observe(axis, 0.5);
+        let corrected = horizontal.corrected(&information);
+        assert!((corrected[(0, 0)] - 3.5).abs() < 1e-9, "{corrected}");
+        horizontal.observe(axis, 0.0);
+        assert!(horizontal.corrected(&information).cholesky().is_some());
+    }
+
+    #[test]
+    fn in_a_unit_shift_the_other_components_follow_to_where_nothing_pulls_them() {
+        let mut information = information(9.0);
+        for (row, column) in [(0, 4), (4, 0)] {
+            information[(row, column)] = 20.0;
+        }
+        let horizontal = Horizontal::new(&information, 1.0).unwrap();
+        let axis = horizontal.doubtful().next().unwrap();
+        let shift = horizontal.unit_shift(axis);
+        assert!((shift.xy().norm() - 1.0).abs() < 1e-9, "{shift}");
+        assert!(shift[4].abs() > 0.01, "{shift}");
+        let pull = information * shift;
+        assert!(pull.fixed_rows::<4>(2).norm() < 1e-9, "{pull}");
+        assert!((shift.dot(&pull) - horizontal.found[axis]).abs() < 1e-9);
     }
 }

@@ -78,40 +78,93 @@ impl RegistrationResult {
     }
 }
 
-/// Registers beams to the map, starting at `initial`; `None` if the beams do not determine the pose.
-/// The caller has to check whether the result is an improvement.
+/// The pose of beams that are registered to the map, starting at `initial`; `None` if they do not determine it.
+/// The caller has to check whether it is an improvement.
+pub(crate) fn registered_pose(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    initial: &Pose3,
+    config: &RegistrationConfig,
+) -> Result<Option<Pose3>, RenderError> {
+    let found = register_all(renderer, beams, initial, config)?;
+    Ok(found.map(|found| found.map_from_lidar))
+}
+
+/// The same with its covariance.
+#[cfg(test)]
 pub(crate) fn register(
     renderer: &dyn RangeRenderer,
     beams: &[Beam],
     initial: &Pose3,
     config: &RegistrationConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
+    let found = register_all(renderer, beams, initial, config)?;
+    found.map_or(Ok(None), |found| found.result(renderer, beams, config))
+}
+
+/// Registers beams, starting at `initial`.
+fn register_all(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    initial: &Pose3,
+    config: &RegistrationConfig,
+) -> Result<Option<Descent>, RenderError> {
     let residuals = linearize(renderer, beams, initial, config)?;
     descend(renderer, beams, *initial, residuals, config)
 }
 
-/// Registers beams, starting at a pose with its residuals.
+/// The end of a registration.
+struct Descent {
+    map_from_lidar: Pose3,
+    /// The pose before the last step.
+    linearized_at: Pose3,
+    /// Residuals there.
+    residuals: Vec<Residual>,
+    equations: Equations,
+    iterations: usize,
+}
+
+impl Descent {
+    /// The pose with its covariance; `None` if the information is singular.
+    fn result(
+        self,
+        renderer: &dyn RangeRenderer,
+        beams: &[Beam],
+        config: &RegistrationConfig,
+    ) -> Result<Option<RegistrationResult>, RenderError> {
+        let (residuals, pose) = (&self.residuals, &self.linearized_at);
+        let covariance = covariance(self.equations, residuals, beams, pose, renderer, config)?;
+        Ok(covariance.map(|covariance| RegistrationResult {
+            map_from_lidar: self.map_from_lidar,
+            covariance,
+            iterations: self.iterations,
+        }))
+    }
+}
+
+/// Registers beams, starting at a pose with their residuals.
 fn descend(
     renderer: &dyn RangeRenderer,
     beams: &[Beam],
     mut pose: Pose3,
     mut residuals: Vec<Residual>,
     config: &RegistrationConfig,
-) -> Result<Option<RegistrationResult>, RenderError> {
+) -> Result<Option<Descent>, RenderError> {
     let mut iterations = 0;
     loop {
         let Some(equations) = Equations::minimal(&residuals, config) else {
             return Ok(None);
         };
         let step = equations.determined_step();
-        let from = pose;
+        let linearized_at = pose;
         pose *= exponential(&step);
         iterations += 1;
         if length_m(&step) < config.tolerance_m || iterations >= config.iterations {
-            let covariance = covariance(equations, &residuals, (beams, &from), renderer, config)?;
-            return Ok(covariance.map(|covariance| RegistrationResult {
+            return Ok(Some(Descent {
                 map_from_lidar: pose,
-                covariance,
+                linearized_at,
+                residuals,
+                equations,
                 iterations,
             }));
         }
@@ -119,24 +172,21 @@ fn descend(
     }
 }
 
-/// Covariance of a pose whose residuals are linearized there or next to it. Directions of which much may be noise are looked at from
-/// both sides. `None` if the information is singular.
+/// Covariance of a pose that is the one of the residuals, or a small step from it. In directions of which much may be noise, beams
+/// are cast from both sides. `None` if the information is singular.
 fn covariance(
     mut equations: Equations,
     residuals: &[Residual],
-    (beams, pose): (&[Beam], &Pose3),
+    beams: &[Beam],
+    pose: &Pose3,
     renderer: &dyn RangeRenderer,
     config: &RegistrationConfig,
 ) -> Result<Option<Matrix6<f64>>, RenderError> {
     for axis in equations.horizontal.doubtful() {
-        let information = &equations.information;
-        let Some(shift) = equations.horizontal.unit_shift(axis, information) else {
-            return Ok(None);
-        };
-        // As far as the residuals of a wall across become outliers.
-        let sides = [-config.kernel_m, config.kernel_m].map(|length_m| length_m * shift);
-        let mut shifted = Vec::with_capacity(sides.len());
-        for shift in sides {
+        // At the scale of the kernel, a residual that is right here has a weight of a quarter there.
+        let shift = config.kernel_m * equations.horizontal.unit_shift(axis);
+        let mut shifted = Vec::with_capacity(2);
+        for shift in [-shift, shift] {
             let there = pose * exponential(&shift);
             shifted.push((shift, linearize(renderer, beams, &there, config)?));
         }
@@ -160,8 +210,8 @@ pub(crate) fn approach(
     let step = beams.len().div_ceil(COARSE_BEAMS);
     let some: Vec<Beam> = beams.iter().step_by(step).copied().collect();
     let coarse = config.with_tolerance(COARSE_TOLERANCE_M);
-    let near = register(renderer, &some, initial, &coarse)?;
-    Ok(near.map_or(*initial, |near| near.map_from_lidar))
+    let near = registered_pose(renderer, &some, initial, &coarse)?;
+    Ok(near.unwrap_or(*initial))
 }
 
 /// Registers the most informative beams, see [`Linearized::registered`].
@@ -171,7 +221,7 @@ pub(crate) fn register_informative(
     near: &Pose3,
     config: &RegistrationConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
-    Linearized::at(renderer, beams, near, config)?.registered()
+    Linearized::new(renderer, beams, near, config)?.registered()
 }
 
 /// Many beams at a pose near the right one: it can be improved, or kept.
@@ -185,7 +235,7 @@ pub(crate) struct Linearized<'a> {
 
 impl<'a> Linearized<'a> {
     /// Finds what the beams hit from a pose.
-    pub fn at(
+    pub fn new(
         renderer: &'a dyn RangeRenderer,
         beams: &'a [Beam],
         map_from_lidar: &Pose3,
@@ -214,8 +264,8 @@ impl<'a> Linearized<'a> {
             return Ok(None);
         };
         let step = equations.determined_step();
-        let at = (*beams, map_from_lidar);
-        let covariance = covariance(equations, residuals, at, *renderer, config)?;
+        let pose = map_from_lidar;
+        let covariance = covariance(equations, residuals, beams, pose, *renderer, config)?;
         Ok(covariance.map(|covariance| RegistrationResult {
             map_from_lidar: *map_from_lidar,
             covariance: covariance + step * step.transpose(),
@@ -238,7 +288,9 @@ impl<'a> Linearized<'a> {
             residuals,
         } = self;
         if beams.len() <= COARSE_BEAMS {
-            return descend(*renderer, beams, *map_from_lidar, residuals.clone(), config);
+            let residuals = residuals.clone();
+            let found = descend(*renderer, beams, *map_from_lidar, residuals, config)?;
+            return found.map_or(Ok(None), |found| found.result(*renderer, beams, config));
         }
         let is_near = |equations: Equations| length_m(&equations.determined_step()) <= NEAR_M;
         let equations = Equations::new(residuals, &Vector6::zeros(), config);
@@ -246,14 +298,17 @@ impl<'a> Linearized<'a> {
             None
         } else {
             let near = approach(*renderer, beams, map_from_lidar, config)?;
-            Some(Self::at(*renderer, beams, &near, config)?)
+            Some(Self::new(*renderer, beams, &near, config)?)
         };
         let near = approached.as_ref().unwrap_or(self);
-        let residuals = informative::choose(&near.residuals, FINE, config);
-        let chosen: Vec<Beam> = (residuals.iter())
-            .map(|residual| beams[residual.beam])
-            .collect();
-        descend(*renderer, &chosen, near.map_from_lidar, residuals, config)
+        let mut residuals = informative::choose(&near.residuals, FINE, config);
+        let mut chosen = Vec::with_capacity(residuals.len());
+        for (number, residual) in residuals.iter_mut().enumerate() {
+            chosen.push(beams[residual.beam]);
+            residual.beam = number;
+        }
+        let found = descend(*renderer, &chosen, near.map_from_lidar, residuals, config)?;
+        found.map_or(Ok(None), |found| found.result(*renderer, &chosen, config))
     }
 }
 
@@ -272,18 +327,20 @@ pub(crate) fn register_coarse_to_fine(
         kernel_m: config.kernel_m.max(wide_kernel_m),
         ..config.with_tolerance(COARSE_TOLERANCE_M)
     };
-    let (mut pose, mut result) = (*initial, None);
+    let (mut pose, mut accepted) = (*initial, None);
     for (beams, config) in beams.into_iter().zip([&wide, config]) {
-        let Some(found) = register(renderer, beams, &pose, config)? else {
+        let Some(found) = register_all(renderer, beams, &pose, config)? else {
             continue;
         };
         if !is_accepted(&found.map_from_lidar) {
             break;
         }
         pose = found.map_from_lidar;
-        result = Some(found);
+        accepted = Some((found, beams, config));
     }
-    Ok(result)
+    accepted.map_or(Ok(None), |(found, beams, config)| {
+        found.result(renderer, beams, config)
+    })
 }
 
 /// Linearized residuals of all beams that pass the gates.

@@ -17,7 +17,7 @@ use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::is_same;
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::SensorAttitude;
-use crate::registration::{RegistrationConfig, approach, register, register_informative};
+use crate::registration::{RegistrationConfig, approach, register_informative, registered_pose};
 use crate::rendering::RenderError;
 
 /// Distance from the prior beyond which a registration is rejected (standard deviations): of normal errors of x, y and heading,
@@ -66,11 +66,10 @@ impl ParticleFilter {
             return Ok(None);
         };
         let count = config.compared_beams;
-        let beams = ClassifiedReturns::of(scan, attitude).choose(count, config.road_share, rng);
+        let beams = ClassifiedReturns::new(scan, attitude).choose(count, config.road_share, rng);
         let start = patch.lift(&predicted, attitude);
         let registration = self.registration().with_tolerance(TOLERANCE_M);
-        let found = register(&*self.map.renderer, &beams, &start, &registration)?;
-        Ok(found.map(|found| found.map_from_lidar))
+        registered_pose(&*self.map.renderer, &beams, &start, &registration)
     }
 
     /// Settings of the registration, cautious ones while the pose is not certain.
@@ -121,7 +120,7 @@ impl ParticleFilter {
         let Some(patch) = self.patch_at(&mean)?.or(self.patch) else {
             return Ok(None);
         };
-        let returns = ClassifiedReturns::of(scan, attitude);
+        let returns = ClassifiedReturns::new(scan, attitude);
         let mut choose = |count| returns.choose(count, config.road_share, rng);
         let (registered, beams) = (choose(config.beams), choose(config.compared_beams));
         let Some(prior) = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)))
@@ -259,7 +258,7 @@ mod tests {
         let config = &filter.config.proposal;
         let [mut rng, mut same] = [2; 2].map(StdRng::seed_from_u64);
         let (count, road_share) = (config.beams, config.road_share);
-        let beams = ClassifiedReturns::of(&scan, &attitude).choose(count, road_share, &mut same);
+        let beams = ClassifiedReturns::new(&scan, &attitude).choose(count, road_share, &mut same);
         let start = filter.patch_at(&mean).unwrap().unwrap();
         let start = start.lift(&mean, &attitude);
         let registration = &config.registration;
