@@ -346,7 +346,7 @@ mod tests {
     use crate::geometry::Vec3;
     use crate::lidar::{LidarModel, RangeImage};
     use crate::map::world_for_tests::TestWorld;
-    use crate::registration::{register, register_informative};
+    use crate::registration::register_informative;
     use crate::rendering::{RangeDifference, RangeRenderer, SurfaceHit};
 
     fn refine(method: Method, off: &Pose2, seed: u64) -> (RefinedFrame, Pose2) {
@@ -539,7 +539,7 @@ mod tests {
         };
         let lifted = objective.lift(&truth, None).unwrap().unwrap();
         let config = FrameRefinementConfig::default();
-        let found = register(&renderer, &beams, &lifted, &config.gauss_newton).unwrap();
+        let found = register_informative(&renderer, &beams, &lifted, &config.gauss_newton).unwrap();
         let led_m =
             (found.unwrap().map_from_lidar.translation.vector - lifted.translation.vector).norm();
         assert!(led_m > 0.05, "{led_m}");

@@ -105,7 +105,7 @@ fn kept(found: f64, share: f64, noise: f64) -> f64 {
 }
 
 /// How much the cost of residuals rises, of what the linearized ones expect, 0 to 1: `shifted` are pairs of a shift and the residuals
-/// there. Beams that have none there are expected to be right.
+/// there. Beams that have none there count as expected.
 pub(super) fn observed_share(
     residuals: &[Residual],
     shifted: &[(Vector6<f64>, Vec<Residual>)],

@@ -35,6 +35,8 @@ mod informative;
 #[cfg(test)]
 mod tests;
 
+use std::borrow::Cow;
+
 use nalgebra::{Matrix3, Matrix6, Vector6};
 
 pub use self::config::RegistrationConfig;
@@ -86,114 +88,8 @@ pub(crate) fn registered_pose(
     initial: &Pose3,
     config: &RegistrationConfig,
 ) -> Result<Option<Pose3>, RenderError> {
-    let found = register_all(renderer, beams, initial, config)?;
+    let found = Linearized::new(renderer, beams, initial, config)?.descend()?;
     Ok(found.map(|found| found.map_from_lidar))
-}
-
-/// The same with its covariance.
-#[cfg(test)]
-pub(crate) fn register(
-    renderer: &dyn RangeRenderer,
-    beams: &[Beam],
-    initial: &Pose3,
-    config: &RegistrationConfig,
-) -> Result<Option<RegistrationResult>, RenderError> {
-    let found = register_all(renderer, beams, initial, config)?;
-    found.map_or(Ok(None), |found| found.result(renderer, beams, config))
-}
-
-/// Registers beams, starting at `initial`.
-fn register_all(
-    renderer: &dyn RangeRenderer,
-    beams: &[Beam],
-    initial: &Pose3,
-    config: &RegistrationConfig,
-) -> Result<Option<Descent>, RenderError> {
-    let residuals = linearize(renderer, beams, initial, config)?;
-    descend(renderer, beams, *initial, residuals, config)
-}
-
-/// The end of a registration.
-struct Descent {
-    map_from_lidar: Pose3,
-    /// The pose before the last step.
-    linearized_at: Pose3,
-    /// Residuals there.
-    residuals: Vec<Residual>,
-    equations: Equations,
-    iterations: usize,
-}
-
-impl Descent {
-    /// The pose with its covariance; `None` if the information is singular.
-    fn result(
-        self,
-        renderer: &dyn RangeRenderer,
-        beams: &[Beam],
-        config: &RegistrationConfig,
-    ) -> Result<Option<RegistrationResult>, RenderError> {
-        let (residuals, pose) = (&self.residuals, &self.linearized_at);
-        let covariance = covariance(self.equations, residuals, beams, pose, renderer, config)?;
-        Ok(covariance.map(|covariance| RegistrationResult {
-            map_from_lidar: self.map_from_lidar,
-            covariance,
-            iterations: self.iterations,
-        }))
-    }
-}
-
-/// Registers beams, starting at a pose with their residuals.
-fn descend(
-    renderer: &dyn RangeRenderer,
-    beams: &[Beam],
-    mut pose: Pose3,
-    mut residuals: Vec<Residual>,
-    config: &RegistrationConfig,
-) -> Result<Option<Descent>, RenderError> {
-    let mut iterations = 0;
-    loop {
-        let Some(equations) = Equations::minimal(&residuals, config) else {
-            return Ok(None);
-        };
-        let step = equations.determined_step();
-        let linearized_at = pose;
-        pose *= exponential(&step);
-        iterations += 1;
-        if length_m(&step) < config.tolerance_m || iterations >= config.iterations {
-            return Ok(Some(Descent {
-                map_from_lidar: pose,
-                linearized_at,
-                residuals,
-                equations,
-                iterations,
-            }));
-        }
-        residuals = linearize(renderer, beams, &pose, config)?;
-    }
-}
-
-/// Covariance of a pose that is the one of the residuals, or a small step from it. In directions of which much may be noise, beams
-/// are cast from both sides. `None` if the information is singular.
-fn covariance(
-    mut equations: Equations,
-    residuals: &[Residual],
-    beams: &[Beam],
-    pose: &Pose3,
-    renderer: &dyn RangeRenderer,
-    config: &RegistrationConfig,
-) -> Result<Option<Matrix6<f64>>, RenderError> {
-    for axis in equations.horizontal.doubtful() {
-        // At the scale of the kernel, a residual that is right here has a weight of a quarter there.
-        let shift = config.kernel_m * equations.horizontal.unit_shift(axis);
-        let mut shifted = Vec::with_capacity(2);
-        for shift in [-shift, shift] {
-            let there = pose * exponential(&shift);
-            shifted.push((shift, linearize(renderer, beams, &there, config)?));
-        }
-        let share = observed_share(residuals, &shifted, config.kernel());
-        equations.horizontal.observe(axis, share);
-    }
-    Ok(equations.covariance())
 }
 
 /// Registers some of many beams coarsely: a pose from which [`register_informative`] goes on. It is the initial one for few beams,
@@ -224,94 +120,6 @@ pub(crate) fn register_informative(
     Linearized::new(renderer, beams, near, config)?.registered()
 }
 
-/// Many beams at a pose near the right one: it can be improved, or kept.
-pub(crate) struct Linearized<'a> {
-    renderer: &'a dyn RangeRenderer,
-    beams: &'a [Beam],
-    map_from_lidar: Pose3,
-    config: &'a RegistrationConfig,
-    residuals: Vec<Residual>,
-}
-
-impl<'a> Linearized<'a> {
-    /// Finds what the beams hit from a pose.
-    pub fn new(
-        renderer: &'a dyn RangeRenderer,
-        beams: &'a [Beam],
-        map_from_lidar: &Pose3,
-        config: &'a RegistrationConfig,
-    ) -> Result<Self, RenderError> {
-        Ok(Self {
-            renderer,
-            beams,
-            map_from_lidar: *map_from_lidar,
-            config,
-            residuals: linearize(renderer, beams, map_from_lidar, config)?,
-        })
-    }
-
-    /// The pose as it is. Its covariance contains the square of the step that it does not take. `None` if the beams do not
-    /// determine the pose.
-    pub fn kept(&self) -> Result<Option<RegistrationResult>, RenderError> {
-        let Self {
-            renderer,
-            beams,
-            map_from_lidar,
-            config,
-            residuals,
-        } = self;
-        let Some(equations) = Equations::new(residuals, &Vector6::zeros(), config) else {
-            return Ok(None);
-        };
-        let step = equations.determined_step();
-        let pose = map_from_lidar;
-        let covariance = covariance(equations, residuals, beams, pose, *renderer, config)?;
-        Ok(covariance.map(|covariance| RegistrationResult {
-            map_from_lidar: *map_from_lidar,
-            covariance: covariance + step * step.transpose(),
-            iterations: 0,
-        }))
-    }
-
-    /// The pose registered by the 4,800 most informative beams, see [`informative::choose`], or by all if these are no more than
-    /// [`approach`] takes. Where the pose turns out to be farther off, they are chosen after an approach. `None` if they do not
-    /// determine it.
-    pub fn registered(&self) -> Result<Option<RegistrationResult>, RenderError> {
-        const FINE: usize = 4800;
-        /// Step up to which the right beams are chosen: half of the default scale of the kernel [m].
-        const NEAR_M: f64 = 0.05;
-        let Self {
-            renderer,
-            beams,
-            map_from_lidar,
-            config,
-            residuals,
-        } = self;
-        if beams.len() <= COARSE_BEAMS {
-            let residuals = residuals.clone();
-            let found = descend(*renderer, beams, *map_from_lidar, residuals, config)?;
-            return found.map_or(Ok(None), |found| found.result(*renderer, beams, config));
-        }
-        let is_near = |equations: Equations| length_m(&equations.determined_step()) <= NEAR_M;
-        let equations = Equations::new(residuals, &Vector6::zeros(), config);
-        let approached = if equations.is_some_and(is_near) {
-            None
-        } else {
-            let near = approach(*renderer, beams, map_from_lidar, config)?;
-            Some(Self::new(*renderer, beams, &near, config)?)
-        };
-        let near = approached.as_ref().unwrap_or(self);
-        let mut residuals = informative::choose(&near.residuals, FINE, config);
-        let mut chosen = Vec::with_capacity(residuals.len());
-        for (number, residual) in residuals.iter_mut().enumerate() {
-            chosen.push(beams[residual.beam]);
-            residual.beam = number;
-        }
-        let found = descend(*renderer, &chosen, near.map_from_lidar, residuals, config)?;
-        found.map_or(Ok(None), |found| found.result(*renderer, &chosen, config))
-    }
-}
-
 /// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second
 /// as configured. Beams that do not determine the pose are passed over, and a pose that is not accepted ends it; the last accepted
 /// one is returned, if any.
@@ -329,18 +137,163 @@ pub(crate) fn register_coarse_to_fine(
     };
     let (mut pose, mut accepted) = (*initial, None);
     for (beams, config) in beams.into_iter().zip([&wide, config]) {
-        let Some(found) = register_all(renderer, beams, &pose, config)? else {
+        let Some(found) = Linearized::new(renderer, beams, &pose, config)?.descend()? else {
             continue;
         };
         if !is_accepted(&found.map_from_lidar) {
             break;
         }
         pose = found.map_from_lidar;
-        accepted = Some((found, beams, config));
+        accepted = Some(found);
     }
-    accepted.map_or(Ok(None), |(found, beams, config)| {
-        found.result(renderer, beams, config)
-    })
+    accepted.map_or(Ok(None), Descent::result)
+}
+
+/// Beams with their residuals at a pose near the right one: it can be improved, or kept.
+#[derive(Clone)]
+pub(crate) struct Linearized<'a> {
+    renderer: &'a dyn RangeRenderer,
+    beams: Cow<'a, [Beam]>,
+    map_from_lidar: Pose3,
+    config: &'a RegistrationConfig,
+    /// Of the beams that have one, ascending by their numbers.
+    residuals: Vec<Residual>,
+}
+
+impl<'a> Linearized<'a> {
+    /// Finds what the beams hit from a pose.
+    pub fn new(
+        renderer: &'a dyn RangeRenderer,
+        beams: &'a [Beam],
+        map_from_lidar: &Pose3,
+        config: &'a RegistrationConfig,
+    ) -> Result<Self, RenderError> {
+        Ok(Self {
+            renderer,
+            beams: beams.into(),
+            map_from_lidar: *map_from_lidar,
+            config,
+            residuals: linearize(renderer, beams, map_from_lidar, config)?,
+        })
+    }
+
+    /// The pose as it is. Its covariance contains the square of the step that it does not take. `None` if the beams do not
+    /// determine the pose.
+    pub fn kept(&self) -> Result<Option<RegistrationResult>, RenderError> {
+        let Some(equations) = Equations::new(&self.residuals, &Vector6::zeros(), self.config)
+        else {
+            return Ok(None);
+        };
+        let step = equations.determined_step();
+        let covariance = self.covariance(equations)?;
+        Ok(covariance.map(|covariance| RegistrationResult {
+            map_from_lidar: self.map_from_lidar,
+            covariance: covariance + step * step.transpose(),
+            iterations: 0,
+        }))
+    }
+
+    /// The pose registered by the most informative beams, or by all if these are no more than [`approach`] takes. Where the pose
+    /// turns out to be farther off, they are chosen after an approach. `None` if they do not determine it.
+    pub fn registered(&self) -> Result<Option<RegistrationResult>, RenderError> {
+        /// Step up to which the right beams are chosen: half of the default scale of the kernel [m].
+        const NEAR_M: f64 = 0.05;
+        let is_near = |equations: Equations| length_m(&equations.determined_step()) <= NEAR_M;
+        let equations = || Equations::new(&self.residuals, &Vector6::zeros(), self.config);
+        let found = if self.beams.len() <= COARSE_BEAMS {
+            self.clone().descend()?
+        } else if equations().is_some_and(is_near) {
+            self.most_informative().descend()?
+        } else {
+            let (renderer, beams, config) = (self.renderer, &self.beams, self.config);
+            let near = approach(renderer, beams, &self.map_from_lidar, config)?;
+            let near = Linearized::new(renderer, beams, &near, config)?;
+            near.most_informative().descend()?
+        };
+        found.map_or(Ok(None), Descent::result)
+    }
+
+    /// The 4,800 most informative beams, see [`informative::choose`].
+    fn most_informative(&self) -> Self {
+        const COUNT: usize = 4800;
+        let mut residuals = informative::choose(&self.residuals, COUNT, self.config);
+        let mut beams = Vec::with_capacity(residuals.len());
+        for (number, residual) in residuals.iter_mut().enumerate() {
+            beams.push(self.beams[residual.beam]);
+            residual.beam = number;
+        }
+        Self {
+            beams: beams.into(),
+            residuals,
+            ..*self
+        }
+    }
+
+    /// Registers the beams, starting at the pose; `None` if they do not determine it.
+    fn descend(mut self) -> Result<Option<Descent<'a>>, RenderError> {
+        let mut iterations = 0;
+        loop {
+            let Some(equations) = Equations::minimal(&self.residuals, self.config) else {
+                return Ok(None);
+            };
+            let step = equations.determined_step();
+            let pose = self.map_from_lidar * exponential(&step);
+            iterations += 1;
+            if length_m(&step) < self.config.tolerance_m || iterations >= self.config.iterations {
+                return Ok(Some(Descent {
+                    map_from_lidar: pose,
+                    before: self,
+                    equations,
+                    iterations,
+                }));
+            }
+            self.residuals = self.residuals_at(&pose)?;
+            self.map_from_lidar = pose;
+        }
+    }
+
+    /// Covariance of the pose, or of one a small step from it. In directions of which much may be noise, beams are cast from both
+    /// sides. `None` if the information is singular.
+    fn covariance(&self, mut equations: Equations) -> Result<Option<Matrix6<f64>>, RenderError> {
+        for axis in equations.horizontal.doubtful() {
+            // At the scale of the kernel, a residual that is right here has a weight of a quarter there.
+            let shift = self.config.kernel_m * equations.horizontal.unit_shift(axis);
+            let mut shifted = Vec::with_capacity(2);
+            for shift in [-shift, shift] {
+                let there = self.map_from_lidar * exponential(&shift);
+                shifted.push((shift, self.residuals_at(&there)?));
+            }
+            let share = observed_share(&self.residuals, &shifted, self.config.kernel());
+            equations.horizontal.observe(axis, share);
+        }
+        Ok(equations.covariance())
+    }
+
+    fn residuals_at(&self, map_from_lidar: &Pose3) -> Result<Vec<Residual>, RenderError> {
+        linearize(self.renderer, &self.beams, map_from_lidar, self.config)
+    }
+}
+
+/// The end of a registration.
+struct Descent<'a> {
+    map_from_lidar: Pose3,
+    /// The beams before the last step.
+    before: Linearized<'a>,
+    /// Of that step.
+    equations: Equations,
+    iterations: usize,
+}
+
+impl Descent<'_> {
+    /// The pose with its covariance; `None` if the information is singular.
+    fn result(self) -> Result<Option<RegistrationResult>, RenderError> {
+        let covariance = self.before.covariance(self.equations)?;
+        Ok(covariance.map(|covariance| RegistrationResult {
+            map_from_lidar: self.map_from_lidar,
+            covariance,
+            iterations: self.iterations,
+        }))
+    }
 }
 
 /// Linearized residuals of all beams that pass the gates.

@@ -9,6 +9,17 @@ use crate::map::SensorAttitude;
 use crate::map::world_for_tests::TestWorld;
 use crate::rendering::CpuRenderer;
 
+/// Registers all beams at once.
+fn register(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    initial: &Pose3,
+    config: &RegistrationConfig,
+) -> Result<Option<RegistrationResult>, RenderError> {
+    let found = Linearized::new(renderer, beams, initial, config)?.descend()?;
+    found.map_or(Ok(None), Descent::result)
+}
+
 fn beams(world: &TestWorld, truth: &Pose2) -> Vec<Beam> {
     world.scan(truth).beams().step_by(3).collect()
 }
@@ -85,6 +96,22 @@ fn a_step_has_the_least_robust_cost_of_the_linearized_residuals() {
             assert!(cost(&beside) > cost(&least), "{component} {sign}");
         }
     }
+}
+
+#[test]
+fn residuals_of_the_most_informative_beams_have_the_numbers_of_these() {
+    let world = TestWorld::street();
+    let pose = lift(&world, &world.pose_at(5.0, 0.3, 0.1));
+    let all: Vec<Beam> = world.scan(&world.pose_at(5.0, 0.31, 0.1)).beams().collect();
+    let config = RegistrationConfig::default();
+    let all = Linearized::new(&world, &all, &pose, &config).unwrap();
+    let chosen = all.most_informative();
+    assert!(chosen.beams.len() < all.beams.len());
+    let again = chosen.residuals_at(&pose).unwrap();
+    let numbered = |residuals: &[Residual]| -> Vec<(usize, f64)> {
+        (residuals.iter().map(|it| (it.beam, it.value_m))).collect()
+    };
+    assert!(numbered(&chosen.residuals) == numbered(&again));
 }
 
 #[test]
