@@ -14,7 +14,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::common::{
-    Fpmcl, Output, copy_into, fpmcl, json, real_recording, run, shared_folder, simulate_two_drives,
+    Fpmcl, Output, copy_of, fpmcl, json, real_recording, run, shared_folder, simulate_two_drives,
 };
 
 /// A street with a bend, scanned by 32 beams that are not evenly spaced, without times.
@@ -49,8 +49,7 @@ static FIRST_DRIVE_MAPPED: LazyLock<TempDir> = LazyLock::new(|| {
 
 /// A folder with two simulated drives and a map of the first, and the true poses of the second in it.
 fn with_first_drive_mapped() -> (TempDir, Vec<Pose3>) {
-    let folder = tempfile::tempdir().unwrap();
-    copy_into(FIRST_DRIVE_MAPPED.path(), folder.path());
+    let folder = copy_of(FIRST_DRIVE_MAPPED.path());
     let truth = truth(folder.path());
     (folder, truth)
 }

@@ -16,7 +16,7 @@ use tempfile::TempDir;
 
 #[cfg(unix)]
 use crate::common::replace_by_pipe;
-use crate::common::{Fpmcl, copy_into, fpmcl, json, shared_folder, simulate_two_drives};
+use crate::common::{Fpmcl, copy_into, copy_of, fpmcl, json, shared_folder, simulate_two_drives};
 
 /// A bend: a straight path determines no rotation about itself.
 const STREET: &str = "\
@@ -34,13 +34,6 @@ static SIMULATED: LazyLock<TempDir> = LazyLock::new(|| {
     folder
 });
 
-/// A copy of [`SIMULATED`].
-fn simulated() -> TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    copy_into(SIMULATED.path(), folder.path());
-    folder
-}
-
 /// Two drives and their finished benchmark, of which other tests take the stages of the first drive.
 static FINISHED: LazyLock<TempDir> = LazyLock::new(|| {
     let folder = shared_folder();
@@ -50,13 +43,6 @@ static FINISHED: LazyLock<TempDir> = LazyLock::new(|| {
     folder
 });
 
-/// A copy of [`FINISHED`].
-fn finished() -> TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    copy_into(FINISHED.path(), folder.path());
-    folder
-}
-
 fn benchmark(folder: &Path) -> Fpmcl {
     let call = fpmcl("benchmark").in_folder(folder);
     let call = call.with("kitti").with("street/drive_1");
@@ -65,7 +51,7 @@ fn benchmark(folder: &Path) -> Fpmcl {
 
 #[test]
 fn two_sessions_give_all_figures_and_a_second_run_takes_what_is_finished() {
-    let folder = finished();
+    let folder = copy_of(FINISHED.path());
     let folder = folder.path();
     let path = folder.join("results/benchmark/benchmark.json");
     let report = json(&path);
@@ -122,7 +108,7 @@ fn two_sessions_give_all_figures_and_a_second_run_takes_what_is_finished() {
 
 #[test]
 fn one_session_without_a_truth_is_divided_and_says_that_it_has_no_errors() {
-    let folder = simulated();
+    let folder = copy_of(SIMULATED.path());
     let folder = folder.path();
     let drive = folder.join("street/drive_1");
     for name in ["poses.txt", "calib.txt"] {
@@ -144,7 +130,7 @@ fn one_session_without_a_truth_is_divided_and_says_that_it_has_no_errors() {
 
 #[test]
 fn a_truth_of_the_second_session_in_another_frame_is_compared_after_alignment() {
-    let folder = finished();
+    let folder = copy_of(FINISHED.path());
     let folder = folder.path();
     // A turn about an inclined axis, and a shift of 50 m.
     let axis = Unit::new_normalize(Vector3::new(0.1, -1.0, 0.2));
@@ -180,7 +166,7 @@ fn a_truth_of_the_second_session_in_another_frame_is_compared_after_alignment() 
 
 #[test]
 fn a_truth_on_a_straight_line_leaves_out_the_errors_after_alignment() {
-    let folder = finished();
+    let folder = copy_of(FINISHED.path());
     let folder = folder.path();
     let poses = folder.join("street/drive_2/poses.txt");
     let count = fs::read_to_string(&poses).unwrap().lines().count();
@@ -199,7 +185,7 @@ fn a_truth_on_a_straight_line_leaves_out_the_errors_after_alignment() {
 
 #[test]
 fn another_error_of_the_evaluation_after_alignment_leaves_the_stage_unfinished() {
-    let folder = simulated();
+    let folder = copy_of(SIMULATED.path());
     let folder = folder.path();
     // Without a truth of the first session, nothing else is evaluated with this key.
     for name in ["poses.txt", "calib.txt"] {
@@ -218,7 +204,7 @@ fn another_error_of_the_evaluation_after_alignment_leaves_the_stage_unfinished()
 
 #[test]
 fn scans_and_truths_that_have_changed_are_measured_again() {
-    let folder = finished();
+    let folder = copy_of(FINISHED.path());
     let folder = folder.path();
     let path = folder.join("results/benchmark/benchmark.json");
     let seconds = |stage: &str| json(&path)["stage_seconds"][stage].clone();
@@ -260,7 +246,7 @@ fn finished_stages(folder: &Path) -> BTreeMap<String, serde_json::Value> {
 fn a_benchmark_that_is_ended_between_its_stages_resumes() {
     /// Time limit for a program that hangs.
     const TIMEOUT: Duration = Duration::from_secs(300);
-    let folder = simulated();
+    let folder = copy_of(SIMULATED.path());
     let folder = folder.path();
     // The program waits for this scan twice: where it opens the sessions, and in the third stage.
     let scan = folder.join("street/drive_2/velodyne/000020.bin");
@@ -313,7 +299,7 @@ fn a_benchmark_that_is_ended_between_its_stages_resumes() {
 
 #[test]
 fn a_key_that_no_stage_has_is_refused() {
-    let folder = simulated();
+    let folder = copy_of(SIMULATED.path());
     let folder = folder.path();
     let call = benchmark(folder).set("num_partikles", "500");
     call.fails_with(&["num_partikles", "localize"]);

@@ -168,6 +168,13 @@ pub fn shared_folder() -> TempDir {
     tempfile::tempdir_in(parent).unwrap()
 }
 
+/// A new folder with a copy of all files below another one.
+pub fn copy_of(folder: &Path) -> TempDir {
+    let copy = tempfile::tempdir().unwrap();
+    copy_into(folder, copy.path());
+    copy
+}
+
 /// Copies all files below a folder.
 pub fn copy_into(from: &Path, to: &Path) {
     fs::create_dir_all(to).unwrap();
