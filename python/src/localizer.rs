@@ -154,7 +154,7 @@ pub struct Estimate {
     /// Pose seen from above: x, y [m], heading [rad], (3,).
     #[pyo3(get)]
     pose: Py<PyArray1<f64>>,
-    /// Pose in space, ``p_map = map_from_lidar @ p_lidar``, aligned to the ground of the map, (4, 4).
+    /// Pose in space, ``p_map = map_from_lidar @ p_lidar``, (4, 4).
     #[pyo3(get)]
     map_from_lidar: Py<PyArray2<f64>>,
     /// Covariance of x, y, heading in the axes of the map, (3, 3) [m², m rad, rad²].

@@ -13,7 +13,8 @@ use crate::map::SensorAttitude;
 pub struct Estimate {
     /// Weighted mean of the particles, `p_map = pose * p_lidar` seen from above.
     pub pose: Pose2,
-    /// The same pose in space, aligned to the ground of the map: `p_map = map_from_lidar * p_lidar`.
+    /// The same pose in space, `p_map = map_from_lidar * p_lidar`: height, roll and pitch are those of the registration, else those
+    /// above the ground of the map.
     pub map_from_lidar: Pose3,
     /// Attitude of the sensor above that ground.
     pub attitude: SensorAttitude,

@@ -92,7 +92,7 @@ pub struct Localizer {
     start: Start,
     seed: u64,
     preparation: ScanPreparation,
-    /// Attitude of the sensor in the last frame.
+    /// Attitude of the sensor with which the last frame began.
     attitude: SensorAttitude,
     sweep: SweepMotion,
     frames: u64,
@@ -160,10 +160,9 @@ impl Localizer {
         let duration_s = self.sweep.duration_s(scan);
         let mut rng = stream(self.seed, FIRST_FRAME_STREAM + self.frames);
         self.frames += 1;
-        let before = self.filter.as_ref().and_then(ParticleFilter::attitude);
-        let known = match odometry {
-            Odometry::Motion(motion) => before.map(|_| self.attitude.after(&motion)),
-            _ => before,
+        let known = match &mut self.filter {
+            Some(filter) => filter.predict(odometry)?,
+            None => None,
         };
         let predicted = self.sweep.predict(odometry, duration_s);
         let start = self.registered(scan, odometry, known, predicted.as_ref(), &mut rng)?;
@@ -184,9 +183,6 @@ impl Localizer {
         filter.set_duration_s(duration_s);
         filter.set_registration_start(start);
         let mut estimate = filter.step(odometry, &image, &self.attitude, &mut rng)?;
-        if let Some(found) = filter.attitude().filter(|found| Some(*found) != before) {
-            self.attitude = found;
-        }
         let pose = Some(estimate.map_from_lidar).filter(|_| estimate.state == State::Tracking);
         let found = pose.and_then(|pose| self.sweep.around(&pose, duration_s));
         self.sweep.update(pose, scan, duration_s);

@@ -179,20 +179,20 @@ impl AgreementMonitor {
         fast < config.min_agreement || fast < config.lost_fraction * slow
     }
 
-    /// Whether a share is so far below the usual one that the pose of its frame is not to be trusted, whatever the averages
-    /// say: as where the motion into it was not what the odometry found.
-    pub fn is_far_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
+    /// Whether a share is nearer to a loss than to the usual one: the pose of its frame is not to be trusted, whatever the averages
+    /// say, as where the motion into it was not what the odometry found.
+    pub fn is_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
         let both = agreement.zip(self.slow);
-        both.is_some_and(|(share, slow)| share < config.lost_fraction * slow)
+        both.is_some_and(|(share, slow)| share < 0.5 * (1.0 + config.lost_fraction) * slow)
     }
 
     /// Whether a share confirms a pose that was uncertain: it is as large as usual here, or nearly all beams agree and it is
     /// nearer to the usual one than to a loss. A wrong pose beyond a tunnel, in which all beams agreed, does not reach that.
     pub fn is_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
-        let is_near = |share: f64, slow: f64| share >= 0.5 * (1.0 + config.lost_fraction) * slow;
         agreement.is_some_and(|share| {
             let is_sure = share >= config.sure_agreement;
-            (self.slow).is_none_or(|slow| share >= slow || is_sure && is_near(share, slow))
+            let is_near = !self.is_below_usual(agreement, config);
+            (self.slow).is_none_or(|slow| share >= slow || is_sure && is_near)
         })
     }
 }
@@ -212,20 +212,18 @@ mod tests {
     }
 
     #[test]
-    fn a_share_far_below_the_usual_one_is_noticed_and_a_first_one_is_not() {
+    fn a_share_nearer_to_a_loss_than_to_the_usual_one_is_noticed_and_a_first_one_is_not() {
         let config = TrackingLossConfig::default();
         let mut monitor = AgreementMonitor::default();
-        assert!(!monitor.is_far_below_usual(Some(0.3), &config));
+        assert!(!monitor.is_below_usual(Some(0.3), &config));
         for _ in 0..5 {
             monitor.observe(Some(0.96), &config);
         }
-        monitor.observe(Some(0.66), &config);
+        monitor.observe(Some(0.82), &config);
         // The averages see no loss yet.
-        assert!(!monitor.is_lost(&config) && monitor.is_far_below_usual(Some(0.66), &config));
-        assert!(
-            !monitor.is_far_below_usual(Some(0.8), &config)
-                && !monitor.is_far_below_usual(None, &config)
-        );
+        assert!(!monitor.is_lost(&config) && monitor.is_below_usual(Some(0.82), &config));
+        let is_below = |share| monitor.is_below_usual(share, &config);
+        assert!(!is_below(Some(0.85)) && !is_below(None));
     }
 
     fn after(agreements: &[f64]) -> bool {

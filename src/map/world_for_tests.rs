@@ -169,6 +169,32 @@ impl TestWorld {
         self.boxes.push(footprint(x.0, x.1, y.0, y.1, height));
     }
 
+    /// Raises the ground of the street by a step beyond x, both in the street frame [m].
+    pub fn put_step(&mut self, x: f32, height_m: f32) {
+        const FAR_M: f32 = 60.0;
+        self.put_box((x, x + FAR_M), (-FAR_M, FAR_M), height_m);
+        let mut mesh = TriangleMesh::default();
+        for (x0, x1, z) in [(x - FAR_M, x, 0.0), (x, x + FAR_M, height_m)] {
+            let corners = [(x0, -FAR_M), (x1, -FAR_M), (x1, FAR_M), (x0, FAR_M)];
+            mesh.append(&TriangleMesh {
+                vertices: corners
+                    .map(|(x, y)| Vec3::new(x, y, GROUND_M as f32 + z))
+                    .into(),
+                triangles: vec![[0, 1, 2], [0, 2, 3]],
+                ..TriangleMesh::default()
+            });
+        }
+        self.ground = GroundMap::from_mesh(&mesh, |_| true, 0.25);
+    }
+
+    /// Poses of a sensor that is carried along the street over a step of 1.2 m at constant height, and the world with that step.
+    pub fn carried_over_a_step() -> (Self, Vec<Pose3>) {
+        let mut world = Self::street();
+        world.put_step(10.0, 1.2);
+        let pose = |frame: u32| Pose3::translation(6.0 + 0.27 * f64::from(frame), 0.3, 0.9);
+        (world, (0..30).map(pose).collect())
+    }
+
     fn ranges(&self, map_from_lidar: &Pose3, directions: &[Vec3]) -> Vec<f32> {
         let map_from_street = crate::geometry::pose3_from_pose2(&self.map_from_street, 0.0);
         let street_from_lidar = Rigid3f::from(&(map_from_street.inverse() * map_from_lidar));

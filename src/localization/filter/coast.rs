@@ -2,7 +2,7 @@
 
 use nalgebra::Matrix3;
 
-use super::state::{ParticleFilter, Pending};
+use super::state::{ParticleFilter, Pending, attitude_above};
 use crate::localization::estimate::Estimate;
 use crate::localization::motion::{TurnDriveTurn, VelocityCommand, jacobian_of_step};
 use crate::localization::odometry::Odometry;
@@ -25,7 +25,9 @@ impl ParticleFilter {
         } else {
             particles.mean()
         };
-        self.estimate_of(pose, particles, covariance, attitude)
+        let ground = self.ground_at(&pose)?;
+        let attitude = attitude_above(&ground, self.predicted, attitude);
+        self.estimate_of(pose, particles, covariance, (&attitude, None))
     }
 
     /// Covariance of the last estimate, propagated by the motion since then [m², m·rad, rad²]:

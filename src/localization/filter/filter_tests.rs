@@ -7,7 +7,7 @@ use nalgebra::Vector2;
 use rand::{SeedableRng, rngs::StdRng};
 
 use super::ParticleFilter;
-use crate::geometry::{Pose2, Pose3, wrap_angle};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::initialization::{StartSpread, around, from_panoramas};
 use crate::localization::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
@@ -619,4 +619,50 @@ fn without_returns_tracking_is_lost_after_some_distance() {
         after_m > 4.0,
         "tracking was lost after {after_m} m without returns"
     );
+}
+
+#[test]
+fn a_sensor_that_is_carried_over_a_step_of_the_ground_keeps_its_height() {
+    let (world, truth) = TestWorld::carried_over_a_step();
+    let mut rng = StdRng::seed_from_u64(5);
+    let start = around(
+        &pose2_from_pose3(&truth[0]),
+        None,
+        500,
+        &StartSpread::default(),
+        &mut rng,
+    );
+    let (config, start) = (LocalizerConfig::of_test(500), ParticleSet::uniform(start));
+    let mut filter = ParticleFilter::new(config, world.map(), None, start).unwrap();
+    let held = |truth: &Pose3| {
+        world
+            .ground
+            .patch_under(&pose2_from_pose3(truth), None)
+            .unwrap()
+            .unwrap()
+    };
+    let (mut before, mut levels_m) = (truth[0], Vec::new());
+    for (frame, truth) in truth.iter().enumerate() {
+        let odometry = Odometry::Motion(before.inverse() * truth);
+        before = *truth;
+        let known = filter.predict(odometry).unwrap();
+        let attitude = known.unwrap_or_else(|| held(truth).attitude_of(truth));
+        let scan = world.scan_in_space(truth);
+        let found = filter.step(odometry, &scan, &attitude, &mut rng).unwrap();
+        if frame < 5 {
+            continue;
+        }
+        assert_eq!(found.state, State::Tracking, "frame {frame}");
+        let off_m = (found.map_from_lidar.translation.vector - truth.translation.vector).norm();
+        assert!(off_m < 0.02, "frame {frame}: {off_m}");
+        // The height is that above the ground below.
+        let (level_m, above_m) = (found.level_m.unwrap(), found.attitude.height_m);
+        assert!(
+            (level_m + above_m - 0.9).abs() < 0.05,
+            "{level_m} {above_m}"
+        );
+        levels_m.push(level_m);
+    }
+    let jump_m = levels_m.windows(2).map(|pair| pair[1] - pair[0]);
+    assert!(jump_m.fold(0.0, f64::max) > 0.5, "{levels_m:?}");
 }

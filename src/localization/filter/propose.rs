@@ -6,7 +6,7 @@ use rand::Rng;
 use super::phase::Phase;
 use super::reweight::Update;
 use super::search::PLACE_BEAMS;
-use super::state::ParticleFilter;
+use super::state::{ParticleFilter, attitude_above};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::observation::{
@@ -16,7 +16,7 @@ use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::is_same;
 use crate::localization::proposal::{Gaussian, regular};
-use crate::map::SensorAttitude;
+use crate::map::{GroundPatch, SensorAttitude};
 use crate::registration::{RegistrationConfig, approach, register_informative, registered_pose};
 use crate::rendering::RenderError;
 
@@ -39,9 +39,9 @@ pub(super) struct Posterior {
     /// Beams that are compared with the map there.
     beams: Vec<Beam>,
     mean_cost_m: Option<f64>,
-    /// Height of the ground [m].
-    level_m: f64,
-    attitude: SensorAttitude,
+    pub(super) attitude: SensorAttitude,
+    /// Above which the attitude is.
+    pub(super) ground: GroundPatch,
     /// Whether the registration refutes the prediction, or replaces one that no scan confirmed.
     pub(super) refutes: bool,
 }
@@ -65,6 +65,7 @@ impl ParticleFilter {
         let Some(patch) = patch.filter(|_| self.phase.is_tracking()) else {
             return Ok(None);
         };
+        let attitude = &attitude_above(&patch, self.predicted, attitude);
         let count = config.compared_beams;
         let beams = ClassifiedReturns::new(scan, attitude).choose(count, config.road_share, rng);
         let start = patch.lift(&predicted, attitude);
@@ -82,11 +83,12 @@ impl ParticleFilter {
     }
 
     /// Registers the scan with the map, from `start` if that is plausible, else from the prediction, and fuses the result with the
-    /// prediction; `None` where registration fails, and where its result is implausible and does not refute the prediction.
+    /// prediction; `None` where registration fails, and where its result is implausible and does not refute the prediction. The
+    /// attitude is that of a pose in space, where it is known.
     pub(super) fn propose(
         &self,
         scan: &RangeImage,
-        attitude: &SensorAttitude,
+        attitude: (&SensorAttitude, Option<Pose3>),
         start: Option<Pose3>,
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
@@ -98,17 +100,35 @@ impl ParticleFilter {
     pub(super) fn propose_widely(
         &self,
         scan: &RangeImage,
-        attitude: &SensorAttitude,
+        attitude: (&SensorAttitude, Option<Pose3>),
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
         self.propose_in(scan, attitude, Basin::Place, rng)
+    }
+
+    /// The same where a scan fits much better elsewhere in the place than at a pose in space to which it led.
+    pub(super) fn propose_elsewhere(
+        &self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        map_from_lidar: &Pose3,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Posterior>, RenderError> {
+        let found = self.propose_widely(scan, (attitude, Some(*map_from_lidar)), rng)?;
+        let Some(found) = found else {
+            return Ok(None);
+        };
+        let there = found.ground.lift(&found.gaussian.mean, &found.attitude);
+        let beams = (&found.beams[..], &found.attitude);
+        let is_better = self.is_refuted(map_from_lidar, &there, beams)?;
+        Ok(is_better.then_some(found))
     }
 
     /// [`propose`](Self::propose) and [`propose_widely`](Self::propose_widely).
     fn propose_in(
         &self,
         scan: &RangeImage,
-        attitude: &SensorAttitude,
+        (attitude, in_space): (&SensorAttitude, Option<Pose3>),
         basin: Basin,
         rng: &mut impl Rng,
     ) -> Result<Option<Posterior>, RenderError> {
@@ -120,6 +140,7 @@ impl ParticleFilter {
         let Some(patch) = self.patch_at(&mean)?.or(self.patch) else {
             return Ok(None);
         };
+        let attitude = &attitude_above(&patch, in_space, attitude);
         let returns = ClassifiedReturns::new(scan, attitude);
         let mut choose = |count| returns.choose(count, config.road_share, rng);
         let (registered, beams) = (choose(config.beams), choose(config.compared_beams));
@@ -177,8 +198,8 @@ impl ParticleFilter {
             gaussian,
             beams,
             mean_cost_m: costs_m[0],
-            level_m: patch.height_m,
             attitude,
+            ground: patch,
             refutes,
         }))
     }
@@ -204,7 +225,7 @@ impl ParticleFilter {
     /// Samples the particles from a posterior.
     pub(super) fn sample(&mut self, posterior: Posterior, rng: &mut impl Rng) -> Update {
         let poses = posterior.gaussian.sample(self.config.num_reduced, rng);
-        let particle = |pose| Particle::new(pose, Some(posterior.level_m));
+        let particle = |pose| Particle::new(pose, Some(posterior.ground.height_m));
         self.particles = ParticleSet::uniform(poses.into_iter().map(particle));
         // Of fewer samples the covariance is that of chance, too.
         let pose = (self.config.num_reduced > 3).then_some(posterior.gaussian.mean);
@@ -212,6 +233,7 @@ impl ParticleFilter {
             mean_cost_m: posterior.mean_cost_m,
             beams: posterior.beams,
             attitude: posterior.attitude,
+            ground: Some(posterior.ground),
             pose,
             refutes: posterior.refutes,
         }
@@ -272,7 +294,7 @@ mod tests {
         let shift = expected * measured * off;
 
         let posterior = filter
-            .propose(&scan, &attitude, None, &mut rng)
+            .propose(&scan, (&attitude, None), None, &mut rng)
             .unwrap()
             .unwrap();
         filter.sample(posterior, &mut rng);
@@ -295,7 +317,7 @@ mod tests {
             let covariance = nalgebra::Matrix3::from_diagonal(&sigmas.component_mul(&sigmas));
             let prior = Gaussian::new(mean, covariance).unwrap();
             let filter = tracking(&world, &prior, &mut rng);
-            let found = filter.propose(&world.scan(&truth), &attitude, start, &mut rng);
+            let found = filter.propose(&world.scan(&truth), (&attitude, None), start, &mut rng);
             let off = |found: Posterior| deviation(&found.gaussian.mean, &truth).xy().norm();
             found.unwrap().map_or(f64::INFINITY, off)
         };
@@ -358,6 +380,38 @@ mod tests {
     }
 
     #[test]
+    fn a_scan_that_fits_much_better_next_to_a_tracked_pose_is_used_there() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let scan = world.scan(&truth);
+        let attitude = SensorAttitude::default();
+        for off_m in [0.0, 0.8, -0.8] {
+            let pose = truth * Pose2::translation(off_m, 0.0);
+            let prior = Gaussian::new(pose, nalgebra::Matrix3::identity() * 1e-4).unwrap();
+            let mut rng = StdRng::seed_from_u64(1);
+            let mut filter = tracking(&world, &prior, &mut rng);
+            let lifted = filter.lift(&pose, &attitude, None).unwrap();
+            let found = filter.propose_elsewhere(&scan, &attitude, &lifted, &mut rng);
+            let found = found.unwrap().map(|found| found.gaussian.mean);
+            assert_eq!(found.is_some(), off_m != 0.0, "{off_m}");
+            if let Some(found) = found {
+                assert_relative_eq!(found, truth, epsilon = 5e-3);
+            }
+            // A registration with a narrow kernel does not lead there.
+            filter.config.proposal.registration.kernel_m = 0.02;
+            filter
+                .agreement
+                .observe(Some(0.98), &filter.config.tracking_loss);
+            let frame = filter
+                .step(Odometry::Unknown, &scan, &attitude, &mut rng)
+                .unwrap();
+            assert_relative_eq!(frame.pose, truth, epsilon = 5e-3);
+            let is_confirmed = frame.state == State::Tracking;
+            assert_eq!(is_confirmed, off_m == 0.0, "{off_m}");
+        }
+    }
+
+    #[test]
     fn of_three_particles_or_fewer_the_pose_is_not_that_of_the_posterior() {
         let world = TestWorld::street();
         let truth = world.pose_at(12.0, 0.2, 0.05);
@@ -368,7 +422,7 @@ mod tests {
             let mut filter = tracking(&world, &prior, &mut rng);
             filter.config.num_reduced = count;
             let attitude = SensorAttitude::default();
-            let posterior = filter.propose(&world.scan(&truth), &attitude, None, &mut rng);
+            let posterior = filter.propose(&world.scan(&truth), (&attitude, None), None, &mut rng);
             let posterior = posterior.unwrap().unwrap();
             let mean = posterior.gaussian.mean;
             let update = filter.sample(posterior, &mut rng);

@@ -18,8 +18,10 @@ pub(super) struct Update {
     pub(super) mean_cost_m: Option<f64>,
     /// The beams of the last round.
     pub(super) beams: Vec<Beam>,
-    /// Attitude of the sensor as estimated in this frame.
+    /// Attitude of the sensor as estimated in this frame, above `ground`.
     pub(super) attitude: SensorAttitude,
+    /// That below the estimate if `None`.
+    pub(super) ground: Option<GroundPatch>,
     /// Pose of the posterior, or of the likeliest of several places; `None` for the weighted mean.
     pub(super) pose: Option<Pose2>,
     /// Whether the scan shows that the prediction is wrong, or replaces one that no scan confirmed.
@@ -70,6 +72,7 @@ impl ParticleFilter {
                     mean_cost_m: weighted_mean(&self.particles, &costs_m),
                     beams,
                     attitude: self.refined_attitude(scan, attitude)?,
+                    ground: None,
                     pose: None,
                     refutes: false,
                 });
@@ -106,16 +109,26 @@ impl ParticleFilter {
         power
     }
 
-    /// Estimate of an updated frame, which is kept for the next frames.
-    pub(super) fn updated_estimate(&mut self, update: &Update) -> Result<Estimate, RenderError> {
+    /// Estimate of an updated frame with its agreement with the map, which is kept for the next frames.
+    pub(super) fn updated_estimate(
+        &mut self,
+        update: &Update,
+        agreement: Option<f64>,
+    ) -> Result<Estimate, RenderError> {
         let pose = update.pose.unwrap_or_else(|| self.particles.mean());
         let covariance = match update.pose {
             Some(_) => self.particles.covariance_about(&pose),
             None => self.particles.covariance_of_estimate(),
         };
         let particles = self.particles.clone();
-        let mut estimate = self.estimate_of(pose, particles, covariance, &update.attitude)?;
+        let mut estimate = self.estimate_of(
+            pose,
+            particles,
+            covariance,
+            (&update.attitude, update.ground),
+        )?;
         estimate.updated = true;
+        estimate.agreement = agreement;
         estimate.mean_cost_m = update.mean_cost_m;
         let is_narrow = self.is_narrow();
         // A jump of a wide distribution is not a motion of the car, nor is the correction of a refuted prediction. One that follows

@@ -97,6 +97,7 @@ impl ParticleFilter {
             mean_cost_m,
             beams,
             attitude,
+            ground: Some(places[best].patch),
             pose: Some(*places[best].pose()),
             refutes: false,
         }))

@@ -2,14 +2,15 @@
 
 use std::time::Duration;
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Matrix3;
 
 use super::phase::{Phase, Search};
-use crate::geometry::{Pose2, Pose3};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::PERIOD_S;
 use crate::localization::config::LocalizerConfig;
 use crate::localization::convergence::is_narrow;
 use crate::localization::estimate::Estimate;
+use crate::localization::odometry::Odometry;
 use crate::localization::particles::{ParticleSet, long_axis_m};
 use crate::localization::tracking_loss::AgreementMonitor;
 use crate::map::{GroundPatch, Map, PanoramaRequest, SensorAttitude};
@@ -37,8 +38,10 @@ pub struct ParticleFilter {
     pub(super) registration_start: Option<Pose3>,
     /// Last known ground below the estimate.
     pub(super) patch: Option<GroundPatch>,
-    /// Attitude of the sensor in the last update.
-    pub(super) attitude: Option<SensorAttitude>,
+    /// Of the last estimate; `None` before the first.
+    pub(super) in_space: Option<InSpace>,
+    /// Pose in space of the next frame, where a motion in space leads to it while tracking.
+    pub(super) predicted: Option<Pose3>,
 }
 
 /// Estimate of an update.
@@ -66,6 +69,22 @@ pub(super) struct LastMotion {
     /// `previous_from_updated`.
     pub increment: Pose2,
     pub duration_s: f64,
+}
+
+/// Pose of a sensor in space, and its attitude above the ground there.
+#[derive(Clone, Copy)]
+pub(super) struct InSpace {
+    pub map_from_lidar: Pose3,
+    pub attitude: SensorAttitude,
+}
+
+/// Attitude of the sensor above a ground: that of a pose in space, where it is known, else a given one.
+pub(super) fn attitude_above(
+    ground: &GroundPatch,
+    in_space: Option<Pose3>,
+    given: &SensorAttitude,
+) -> SensorAttitude {
+    in_space.map_or(*given, |map_from_lidar| ground.attitude_of(&map_from_lidar))
 }
 
 impl Updated {
@@ -107,7 +126,8 @@ impl ParticleFilter {
             last_motion: None,
             duration_s: PERIOD_S,
             registration_start: None,
-            attitude: None,
+            in_space: None,
+            predicted: None,
         })
     }
 
@@ -129,33 +149,49 @@ impl ParticleFilter {
         self.registration_start = start;
     }
 
-    /// Attitude of the sensor in the last frame if it is a good start for the next: while tracking it
-    /// comes from the map, which is more accurate than the ground plane of a single scan.
-    pub fn attitude(&self) -> Option<SensorAttitude> {
+    /// Follows the sensor by a motion. Returns its attitude, with which the next frame begins: while tracking it comes from the map,
+    /// which is more accurate than the ground plane of a single scan; `None` while not tracking. A motion in space is followed in
+    /// space: under a sensor that is carried, the ground may rise by a step.
+    pub fn predict(&mut self, odometry: Odometry) -> Result<Option<SensorAttitude>, RenderError> {
+        self.predicted = None;
         let proposes = self.config.proposal.scan && self.phase.is_tracking();
-        self.attitude.filter(|_| proposes)
+        let Some(last) = self.in_space.filter(|_| proposes) else {
+            return Ok(None);
+        };
+        let Odometry::Motion(motion) = odometry else {
+            return Ok(Some(last.attitude));
+        };
+        let map_from_lidar = last.map_from_lidar * motion;
+        self.predicted = Some(map_from_lidar);
+        let ground = self.ground_at(&pose2_from_pose3(&map_from_lidar))?;
+        Ok(Some(ground.attitude_of(&map_from_lidar)))
     }
 
-    /// Estimate of a frame whose scan was not used, in space on the ground below it or, without any, on
-    /// the last known ground. `covariance` is without the error of the map, which is added.
+    /// Estimate of a frame at a pose, of which the attitude is above `ground`, by default the ground below it or, without any, the last
+    /// known one. `covariance` is without the error of the map, which is added.
     pub(super) fn estimate_of(
         &mut self,
         pose: Pose2,
         particles: ParticleSet,
         covariance: Matrix3<f64>,
-        attitude: &SensorAttitude,
+        (attitude, ground): (&SensorAttitude, Option<GroundPatch>),
     ) -> Result<Estimate, RenderError> {
+        let map_from_lidar = self.lift(&pose, attitude, ground)?;
         let found = self.patch_at(&pose)?;
         self.patch = found.or(self.patch);
-        let level = GroundPatch {
-            height_m: 0.0,
-            normal: Vector3::z(),
+        let in_space = InSpace {
+            map_from_lidar,
+            attitude: match ground {
+                Some(_) => self.patch.unwrap_or_default().attitude_of(&map_from_lidar),
+                None => *attitude,
+            },
         };
+        self.in_space = Some(in_space);
         let covariance = covariance + self.config.proposal.registration.of_map();
         Ok(Estimate {
             pose,
-            map_from_lidar: self.patch.unwrap_or(level).lift(&pose, attitude),
-            attitude: *attitude,
+            map_from_lidar,
+            attitude: in_space.attitude,
             level_m: self.patch.map(|patch| patch.height_m),
             covariance,
             effective_sample_size: particles.effective_sample_size(),
@@ -168,6 +204,36 @@ impl ParticleFilter {
             motion: None,
             particles,
         })
+    }
+
+    /// Moves the last estimate in height, roll and pitch to a pose in space.
+    pub(super) fn move_in_space(&mut self, estimate: &mut Estimate, map_from_lidar: Pose3) {
+        let attitude = (self.patch.unwrap_or_default()).attitude_of(&map_from_lidar);
+        self.in_space = Some(InSpace {
+            map_from_lidar,
+            attitude,
+        });
+        estimate.map_from_lidar = map_from_lidar;
+        estimate.attitude = attitude;
+    }
+
+    /// A pose in space, by the attitude of the sensor above `ground` or, without that, above the ground below it.
+    pub(super) fn lift(
+        &self,
+        pose: &Pose2,
+        attitude: &SensorAttitude,
+        ground: Option<GroundPatch>,
+    ) -> Result<Pose3, RenderError> {
+        let ground = match ground {
+            Some(ground) => ground,
+            None => self.ground_at(pose)?,
+        };
+        Ok(ground.lift(pose, attitude))
+    }
+
+    /// The ground below a pose, or the last known one.
+    pub(super) fn ground_at(&self, pose: &Pose2) -> Result<GroundPatch, RenderError> {
+        Ok(self.patch_at(pose)?.or(self.patch).unwrap_or_default())
     }
 
     /// Whether a position with a covariance is certain enough to be reported as tracked.

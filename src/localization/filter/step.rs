@@ -1,5 +1,7 @@
 //! One step of the filter: propagation, measurement update, change of the phase, resampling.
 
+use std::mem;
+
 use nalgebra::Matrix3;
 use rand::Rng;
 
@@ -37,35 +39,57 @@ impl ParticleFilter {
         }
         self.propagate(odometry, rng);
         let posterior = if self.phase.is_tracking() {
-            self.propose(scan, attitude, start, rng)?
+            self.propose(scan, (attitude, self.predicted), start, rng)?
         } else if self.has_converged_unconfirmed() {
-            self.propose_widely(scan, attitude, rng)?
+            self.propose_widely(scan, (attitude, None), rng)?
         } else {
             None
         };
+        let predicted = self.phase.is_tracking().then(|| self.particles.clone());
         let mut update = match posterior {
             Some(posterior) => self.sample(posterior, rng),
             None => self.reweight_widely(scan, attitude, rng)?,
         };
-        let mut estimate = self.compared_estimate(&update)?;
+        let (mut map_from_lidar, mut agreement) = self.compared(&update)?;
+        if let Some(predicted) = predicted
+            && (self.agreement).is_below_usual(agreement, &self.config.tracking_loss)
+        {
+            let updated = mem::replace(&mut self.particles, predicted);
+            match self.propose_elsewhere(scan, &update.attitude, &map_from_lidar, rng)? {
+                Some(elsewhere) => {
+                    update = self.sample(elsewhere, rng);
+                    (map_from_lidar, agreement) = self.compared(&update)?;
+                }
+                None => self.particles = updated,
+            }
+        }
+        let mut estimate = self.updated_estimate(&update, agreement)?;
         let mut evidence = self.evidence(&estimate, odometry, update.refutes);
         let is_found = evidence.is_confirmed && !self.phase.is_tracking();
-        if is_found
-            && let Some(posterior) = self.propose(scan, &update.attitude, None, rng)?
-            && posterior.refutes
-        {
-            update = self.sample(posterior, rng);
-            estimate = self.compared_estimate(&update)?;
+        let found_at = (&update.attitude, Some(map_from_lidar));
+        if is_found && let Some(posterior) = self.propose(scan, found_at, None, rng)? {
+            if posterior.refutes {
+                update = self.sample(posterior, rng);
+                (_, agreement) = self.compared(&update)?;
+                estimate = self.updated_estimate(&update, agreement)?;
+            } else {
+                // The scan was used for the planar pose. Height, roll and pitch are those of the registration where they fit.
+                let there = posterior.ground.lift(&estimate.pose, &posterior.attitude);
+                let share = self.agreement_at(&there, &update.beams, &posterior.attitude)?;
+                if share >= agreement {
+                    self.move_in_space(&mut estimate, there);
+                    estimate.agreement = share;
+                }
+            }
         }
         if update.refutes {
             evidence = evidence.refuted();
         }
-        self.attitude = Some(update.attitude);
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
-        let is_far_below_usual =
-            (self.agreement).is_far_below_usual(estimate.agreement, &self.config.tracking_loss);
-        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_far_below_usual;
+        let is_below_usual =
+            (self.agreement).is_below_usual(estimate.agreement, &self.config.tracking_loss);
+        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_below_usual;
         estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
@@ -79,12 +103,12 @@ impl ParticleFilter {
         self.phase.is_unconfirmed() && is_one_place && self.is_narrow()
     }
 
-    /// The estimate after an update, with its agreement with the map.
-    fn compared_estimate(&mut self, update: &Update) -> Result<Estimate, RenderError> {
-        let mut estimate = self.updated_estimate(update)?;
-        estimate.agreement =
-            self.agreement_at(&estimate.map_from_lidar, &update.beams, &update.attitude)?;
-        Ok(estimate)
+    /// The pose of an update in space, and its agreement with the map.
+    fn compared(&self, update: &Update) -> Result<(Pose3, Option<f64>), RenderError> {
+        let pose = update.pose.unwrap_or_else(|| self.particles.mean());
+        let map_from_lidar = self.lift(&pose, &update.attitude, update.ground)?;
+        let agreement = self.agreement_at(&map_from_lidar, &update.beams, &update.attitude)?;
+        Ok((map_from_lidar, agreement))
     }
 
     /// Adds the motion into a frame to the motion since the last update.
@@ -155,7 +179,7 @@ impl ParticleFilter {
         coasted.agreement = self.agreement_at(&coasted.map_from_lidar, &beams, attitude)?;
         let (agreement, config) = (coasted.agreement, &self.config.tracking_loss);
         let contradicts = agreement.is_some_and(|share| share < config.min_agreement)
-            || self.agreement.is_far_below_usual(agreement, config);
+            || self.agreement.is_below_usual(agreement, config);
         if contradicts && self.phase == Phase::Tracking {
             return Ok(None);
         }

@@ -52,14 +52,6 @@ impl SensorAttitude {
         )
     }
 
-    /// The attitude after a motion in space, on a road that stays even.
-    pub(crate) fn after(&self, previous_from_current: &Pose3) -> Self {
-        let road_from_lidar = self.road_from_lidar() * previous_from_current;
-        let up = road_from_lidar.rotation.inverse() * Vector3::z();
-        let up = up.cast::<f32>();
-        Self::from_plane(Vec3::new(up.x, up.y, up.z), road_from_lidar.translation.z)
-    }
-
     /// Computes the attitude from the plane of the road in the lidar frame: its unit normal (up) and
     /// the distance of the sensor from it [m].
     pub(crate) fn from_plane(up_in_lidar: Vec3, height_m: f64) -> Self {
@@ -73,12 +65,13 @@ impl SensorAttitude {
     }
 }
 
-/// Plane of the ground around a point.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// Plane of the ground around a point; by default that of the map's x and y.
+#[derive(Clone, Copy, Debug, PartialEq, SmartDefault)]
 pub struct GroundPatch {
     /// Height at the point, map frame [m].
     pub height_m: f64,
     /// Unit normal, up.
+    #[default(Vector3::z())]
     pub normal: Vector3<f64>,
 }
 
@@ -105,6 +98,15 @@ impl GroundPatch {
             Translation3::new(t.x, t.y, height_m),
             UnitQuaternion::from_euler_angles(0.0, 0.0, turn_rad) * tilted,
         )
+    }
+
+    /// The same plane around another point, a shift in x and y away [m].
+    pub(crate) fn shifted(&self, shift: &Vector2<f64>) -> Self {
+        let rise_m = -self.normal.xy().dot(shift) / self.normal.z;
+        Self {
+            height_m: self.height_m + rise_m,
+            ..*self
+        }
     }
 
     /// Computes the attitude of a sensor above the plane of this patch; [`lift`](Self::lift) of the

@@ -251,6 +251,20 @@ fn a_lifted_pose_projects_to_its_planar_pose_on_every_slope() {
 }
 
 #[test]
+fn a_shifted_patch_is_the_same_plane() {
+    let normal = Vector3::new(-0.2, 0.1, 1.0).normalize();
+    let patch = GroundPatch {
+        height_m: 2.0,
+        normal,
+    };
+    let shift = Vector2::new(3.0, -5.0);
+    let shifted = patch.shifted(&shift);
+    let along = shift.push(shifted.height_m - patch.height_m);
+    assert_relative_eq!(normal.dot(&along), 0.0, epsilon = 1e-12);
+    assert_eq!(shifted.normal, normal);
+}
+
+#[test]
 fn the_attitude_is_estimated_from_returns_of_a_slope_with_outliers() {
     let ground = GroundMap::from_mesh(&slope(0.06), |_| true, 0.5);
     let pose = Pose2::new(Vector2::new(1.0, 2.0), 0.6);
