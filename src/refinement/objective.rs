@@ -4,7 +4,7 @@
 //! f(x, y, θ) = mean over the beams of cost(measured, rendered from lift(x, y, θ))      [m]
 //! ```
 //!
-//! The pose is aligned to the ground of the map, as in localization: x, y and heading are free.
+//! The pose is above the ground of the map, or above a known one, as in localization: x, y and heading are free.
 
 use crate::geometry::{Pose2, Pose3, Vec3};
 use crate::lidar::Beam;
@@ -28,6 +28,8 @@ pub struct FrameObjective<'a> {
     pub level_m: Option<f64>,
     /// Attitude of the sensor above the ground.
     pub attitude: SensorAttitude,
+    /// The ground above which that is known; `None` for that of the map under a pose, above which it is an initial value.
+    pub known_ground: Option<GroundPatch>,
     /// Cost of a difference.
     pub difference: RangeDifference,
 }
@@ -39,9 +41,17 @@ impl FrameObjective<'_> {
         pose: &Pose2,
         remembered: Option<&GroundPatch>,
     ) -> Result<Option<Pose3>, RenderError> {
-        let patch = self.ground.patch_under(pose, self.level_m)?;
+        let patch = self.patch_under(pose)?;
         let patch = patch.as_ref().or(remembered);
         Ok(patch.map(|patch| patch.lift(pose, &self.attitude)))
+    }
+
+    /// The ground under a pose, or that above which the attitude is known.
+    pub fn patch_under(&self, pose: &Pose2) -> Result<Option<GroundPatch>, RenderError> {
+        Ok(match self.known_ground {
+            None => self.ground.patch_under(pose, self.level_m)?,
+            known => known,
+        })
     }
 
     /// The ground under a pose, or the nearest part of it within a distance [m].
@@ -50,7 +60,7 @@ impl FrameObjective<'_> {
         pose: &Pose2,
         distance_m: f64,
     ) -> Result<Option<GroundPatch>, RenderError> {
-        let mut patch = self.ground.patch_under(pose, self.level_m)?;
+        let mut patch = self.patch_under(pose)?;
         let t = pose.translation.vector;
         for radius_m in [4.0, 8.0] {
             if patch.is_none() && radius_m <= distance_m + 2.0 {
@@ -61,8 +71,11 @@ impl FrameObjective<'_> {
     }
 
     /// Returns the objective with the attitude fitted at a pose, so that the beams on the road end on the
-    /// mapped ground; unchanged where too few of them do.
+    /// mapped ground; unchanged where too few of them do, and where it is known.
     pub fn with_fitted_attitude(&self, pose: &Pose2) -> Result<Self, RenderError> {
+        if self.known_ground.is_some() {
+            return Ok(*self);
+        }
         let points: Vec<Vec3> = self.beams.iter().map(Beam::point).collect();
         let attitude = self
             .ground
@@ -139,6 +152,7 @@ mod tests {
                 registered: beams,
                 level_m: None,
                 attitude: SensorAttitude::default(),
+                known_ground: None,
                 difference: RangeDifference::truncated(0.5),
             }
         }
@@ -188,6 +202,7 @@ mod tests {
                 registered: &beams,
                 level_m: None,
                 attitude: SensorAttitude::default(),
+                known_ground: None,
                 difference: RangeDifference::truncated(0.5),
             };
             let found = objective.on_best_level(&pose).unwrap().level_m.unwrap();

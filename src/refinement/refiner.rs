@@ -15,7 +15,7 @@ use super::upright::UprightSurfaces;
 use super::wide_search::{self, WideSearchConfig};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
-use crate::map::SensorAttitude;
+use crate::map::{GroundPatch, SensorAttitude};
 use crate::registration::{Linearized, RegistrationConfig, RegistrationResult};
 use crate::rendering::RenderError;
 use crate::validation::{
@@ -137,10 +137,10 @@ pub struct RefinedFrame {
     pub start_in_space: Pose3,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
-    /// Attitude of the sensor above the mapped ground.
+    /// Attitude of the sensor above the ground.
     pub attitude: SensorAttitude,
-    /// Height of that ground [m].
-    pub level_m: Option<f64>,
+    /// That ground, known or mapped; `None` where there is none under the pose.
+    pub ground: Option<GroundPatch>,
     /// Objective at the estimate [m].
     pub cost_before_m: f64,
     /// Objective at the result, never larger than before [m].
@@ -172,8 +172,8 @@ pub enum Distance<'a> {
 }
 
 /// Refines an estimate with its covariance of (x, y, heading). The attitude of the objective is an
-/// initial value, which is first fitted to the mapped ground. `None` where there is no ground under the estimate or
-/// the scan has no beams.
+/// initial value, which is first fitted to the mapped ground, unless it is known. `None` where no ground is mapped under the
+/// estimate and none is known, or the beams do not determine the pose there, and where the scan has no beams.
 pub fn refine_frame(
     objective: &FrameObjective<'_>,
     estimate: &Pose2,
@@ -182,6 +182,12 @@ pub fn refine_frame(
     config: &FrameRefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<Option<RefinedFrame>, RenderError> {
+    // A swarm follows the mapped ground.
+    let known_ground = (objective.known_ground).filter(|_| config.method != Method::Swarm);
+    let objective = &FrameObjective {
+        known_ground,
+        ..*objective
+    };
     let reach = config.reach(covariance);
     let (objective, reach_m) = match distance {
         Distance::Far(_) => (*objective, reach[0].max(reach[1])),
@@ -202,7 +208,7 @@ pub fn refine_frame(
         start_in_space: lifted,
         covariance: *covariance,
         attitude: objective.attitude,
-        level_m: objective.level_m,
+        ground: None,
         cost_before_m,
         cost_after_m: cost_before_m,
     };
@@ -226,12 +232,15 @@ pub fn refine_frame(
         Method::Swarm => linearized(objective, &frame, config)?.kept()?,
         Method::None => None,
     };
-    let patch = objective
+    let mapped = objective
         .ground
         .patch_under(&frame.pose, objective.level_m)?;
-    if let Some(patch) = &patch {
-        frame.attitude = patch.attitude_of(&frame.map_from_lidar);
-        frame.level_m = Some(patch.height_m);
+    if mapped.is_none() && registered.is_none() {
+        return Ok(None);
+    }
+    frame.ground = objective.known_ground.or(mapped);
+    if let Some(ground) = &frame.ground {
+        frame.attitude = ground.attitude_of(&frame.map_from_lidar);
     }
     if config.method != Method::None {
         let covariance = registered.map(|registered| registered.planar_covariance());
@@ -275,9 +284,7 @@ fn search(
 ) -> Result<(), RenderError> {
     let reach = config.reach(&frame.covariance);
     let dimensions = Dimension::around(&frame.pose, reach, 0.5);
-    let patch = objective
-        .ground
-        .patch_under(&frame.pose, objective.level_m)?;
+    let patch = objective.patch_under(&frame.pose)?;
     let step = objective.beams.len().div_ceil(config.swarm_beams).max(1);
     let beams: Vec<Beam> = objective.beams.iter().step_by(step).copied().collect();
     let coarse = FrameObjective {

@@ -195,7 +195,9 @@ pub struct FrameResult {
     pub state: State,
     /// What the refinement changed; `None` where the frame was not refined.
     pub change: Option<FrameChange>,
+    /// Above `ground`, or above the mapped ground at about `level_m`.
     attitude: SensorAttitude,
+    ground: Option<GroundPatch>,
     /// Height of the ground below the sensor [m], if known.
     level_m: Option<f64>,
 }
@@ -214,14 +216,14 @@ pub struct FrameChange {
 pub struct RefinedTrajectory {
     /// `map_from_lidar` seen from above.
     pub poses: Vec<Pose2>,
-    /// `map_from_lidar` in space, aligned to the ground of the map.
+    /// `map_from_lidar` in space; not refined ones are above the ground of the map.
     pub map_from_lidar: Vec<Pose3>,
     /// Covariances of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariances: Vec<Matrix3<f64>>,
     /// Frames that the filter did not track and that could not be placed from their neighbours.
     pub untracked: usize,
-    /// Tracked frames that were not refined because there is no mapped ground under the car, or no
-    /// beam in the scan.
+    /// Tracked frames that were not refined because there is no mapped ground under the car, and too few beams meet the map or
+    /// the pose in space is not known, or no beam is in the scan.
     pub unmapped: usize,
     /// Whether the trajectory was smoothed.
     pub is_smoothed: bool,
@@ -357,7 +359,12 @@ impl TrajectoryRefiner {
         let mut rng = stream(self.seed, (self.forgotten + self.frames.len()) as u64);
         let image = self.preparation.range_image(scan, estimate.motion.as_ref());
         let previous = self.frames.last();
-        let known = self.attitude_and_level_of(estimate)?;
+        let mapped = self.mapped_ground_of(estimate)?;
+        let known = self.in_space(estimate);
+        let assumed = known.map(|map_from_lidar| self.assumed_ground(&map_from_lidar));
+        let ground = mapped.or(assumed);
+        let attitude =
+            (known.zip(ground)).map(|(map_from_lidar, ground)| ground.attitude_of(&map_from_lidar));
         let level_before_m = previous
             .filter(|_| estimate.state != State::Lost)
             .and_then(|previous| previous.level_m);
@@ -367,8 +374,9 @@ impl TrajectoryRefiner {
             covariance: estimate.covariance(),
             state: estimate.state,
             change: None,
-            attitude: known.map_or_else(|| self.initial_attitude(&image), |(attitude, _)| attitude),
-            level_m: known.map(|(_, level_m)| level_m).or(level_before_m),
+            attitude: attitude.unwrap_or_else(|| self.initial_attitude(&image)),
+            ground,
+            level_m: mapped.map(|ground| ground.height_m).or(level_before_m),
         };
         let is_tracked = frame.is_tracked();
         if is_tracked && !self.config.refinement.is_wide(&frame.covariance) {
@@ -382,6 +390,7 @@ impl TrajectoryRefiner {
             // What the uncertainty says, then twice as far.
             let far = [1.0, 4.0].map(|factor| FrameResult {
                 covariance: factor * frame.covariance,
+                ground: None,
                 level_m: None,
                 ..frame.clone()
             });
@@ -462,21 +471,35 @@ impl TrajectoryRefiner {
         Ok(())
     }
 
-    /// Attitude of the sensor above the mapped ground, and the height of that ground [m], where the estimate of a tracked
-    /// frame is known in space.
-    fn attitude_and_level_of(
+    /// Pose in space of a tracked frame, where it is known.
+    fn in_space(&self, estimate: &InitialEstimate) -> Option<Pose3> {
+        let is_tracked = estimate.state == State::Tracking;
+        estimate.map_from_lidar.filter(|_| is_tracked)
+    }
+
+    /// The mapped ground below the estimate of a tracked frame that is known in space; `None` for other frames and where the map has
+    /// none.
+    fn mapped_ground_of(
         &self,
         estimate: &InitialEstimate,
-    ) -> Result<Option<(SensorAttitude, f64)>, RenderError> {
-        let is_tracked = estimate.state == State::Tracking;
-        let Some(map_from_lidar) = estimate.map_from_lidar.filter(|_| is_tracked) else {
+    ) -> Result<Option<GroundPatch>, RenderError> {
+        let Some(map_from_lidar) = self.in_space(estimate) else {
             return Ok(None);
         };
         let place = map_from_lidar.translation;
         let levels = self.map.ground.levels_at(place.x, place.y)?;
         let below = levels.iter().rfind(|patch| patch.height_m < place.z);
-        let known = |patch: &GroundPatch| (patch.attitude_of(&map_from_lidar), patch.height_m);
-        Ok(below.or(levels.first()).map(known))
+        Ok(below.or(levels.first()).copied())
+    }
+
+    /// A level ground, as far below a pose as the ground of the frame before was.
+    fn assumed_ground(&self, map_from_lidar: &Pose3) -> GroundPatch {
+        let before = self.frames.last().map(|frame| frame.attitude);
+        let attitude = before.unwrap_or_else(|| self.preparation.assumed_attitude());
+        GroundPatch {
+            height_m: map_from_lidar.translation.z - attitude.height_m,
+            ..GroundPatch::default()
+        }
     }
 
     /// Attitude of the sensor in the next frame. That of a registered frame is more accurate than the
@@ -529,9 +552,10 @@ impl TrajectoryRefiner {
             registered: &registered,
             level_m: frame.level_m,
             attitude: frame.attitude,
+            known_ground: frame.ground,
             difference: observation.difference(),
         };
-        if frame.level_m.is_none() {
+        if frame.level_m.is_none() && frame.ground.is_none() {
             objective = objective.on_best_level(&frame.pose)?;
         }
         let config = &self.config.refinement;
@@ -558,7 +582,12 @@ impl TrajectoryRefiner {
         frame.map_from_lidar = Some(refined.map_from_lidar);
         frame.covariance = refined.covariance;
         frame.attitude = refined.attitude;
-        frame.level_m = refined.level_m.or(frame.level_m);
+        // An assumed ground is at no level of the map.
+        if frame.ground.is_none() || frame.level_m.is_some() {
+            let level_m = refined.ground.map(|ground| ground.height_m);
+            frame.level_m = level_m.or(frame.level_m);
+        }
+        frame.ground = refined.ground;
         Ok(Some(after))
     }
 
@@ -679,11 +708,16 @@ impl TrajectoryRefiner {
         poses[rows].copy_from_slice(&smoothed);
     }
 
-    /// The poses in space, aligned to the ground of the map, or to the last known ground.
+    /// The poses in space, above the ground of their frames, else above that of the map, or the last known ground.
     fn lift(&self, poses: &[Pose2]) -> Result<Vec<Pose3>, RenderError> {
         let mut patch = None;
         let lift = |(pose, frame): (&Pose2, &FrameResult)| {
-            patch = (self.map.ground.patch_under(pose, frame.level_m)?).or(patch);
+            let shift = pose.translation.vector - frame.pose.translation.vector;
+            let found = match &frame.ground {
+                Some(ground) if frame.is_refined() => Some(ground.shifted(&shift)),
+                _ => self.map.ground.patch_under(pose, frame.level_m)?,
+            };
+            patch = found.or(patch);
             Ok(match &patch {
                 Some(patch) => patch.lift(pose, &frame.attitude),
                 None => pose3_from_pose2(pose, 0.0),
@@ -700,6 +734,7 @@ impl FrameResult {
             pose,
             covariance: Matrix3::zeros(),
             state: State::Tracking,
+            ground: None,
             ..self.clone()
         }
     }
@@ -733,7 +768,7 @@ mod tests {
     use crate::geometry::pose2_from_pose3;
     use crate::lidar::LidarModel;
     use crate::map::world_for_tests::TestWorld;
-    use crate::map::{MapCache, MapOptions, MappingPath};
+    use crate::map::{GroundMap, MapCache, MapOptions, MappingPath};
     use crate::rendering::Backend;
 
     fn sensor() -> Sensor {
@@ -750,6 +785,7 @@ mod tests {
             state,
             change: None,
             attitude: SensorAttitude::default(),
+            ground: None,
             level_m: None,
         }
     }
@@ -993,6 +1029,37 @@ mod tests {
     }
 
     #[test]
+    fn a_trajectory_over_a_step_of_the_ground_keeps_its_height_also_where_none_is_mapped() {
+        let (mut world, truth) = TestWorld::carried_over_a_step();
+        for has_ground in [true, false] {
+            if !has_ground {
+                world.ground = GroundMap::from_mesh(&TriangleMesh::default(), |_| true, 0.25);
+            }
+            let (map, config) = (world.map(), RefinerConfig::default());
+            let mut refiner = TrajectoryRefiner::new(&map, &sensor(), config, 0).unwrap();
+            for pose in &truth {
+                let scan = Scan {
+                    points: world.scan_in_space(pose).points,
+                    ..Scan::default()
+                };
+                let off = Pose3::translation(0.01, -0.01, 0.01) * pose;
+                let estimate = InitialEstimate {
+                    map_from_lidar: Some(off),
+                    covariance: Some(Matrix3::identity() * 1e-4),
+                    ..InitialEstimate::tracked(pose2_from_pose3(&off))
+                };
+                refiner.add(&scan, &estimate).unwrap();
+            }
+            let refined = refiner.finish(None).unwrap();
+            assert_eq!((refined.untracked, refined.unmapped), (0, 0));
+            for (found, truth) in refined.map_from_lidar.iter().zip(&truth) {
+                let off_m = (found.translation.vector - truth.translation.vector).norm();
+                assert!(off_m < 0.005, "{off_m}");
+            }
+        }
+    }
+
+    #[test]
     fn the_ground_of_a_sensor_is_the_highest_level_below_it() {
         let mut mesh = TriangleMesh::default();
         for height_m in [0.0, 6.0] {
@@ -1016,14 +1083,12 @@ mod tests {
                 map_from_lidar: Some(at(z)),
                 ..InitialEstimate::tracked(pose2_from_pose3(&at(z)))
             };
-            let known =
-                |estimate: &InitialEstimate| refiner.attitude_and_level_of(estimate).unwrap();
-            let (attitude, level_m) = known(&estimate).unwrap();
-            assert_relative_eq!(level_m, expected_m, epsilon = 1e-6);
-            assert_relative_eq!(attitude.height_m, z - expected_m, epsilon = 1e-6);
-            // Where the filter is not sure of its pose, its attitude is not used either.
+            let ground = |estimate: &InitialEstimate| refiner.mapped_ground_of(estimate).unwrap();
+            let found = ground(&estimate).unwrap();
+            assert_relative_eq!(found.height_m, expected_m, epsilon = 1e-6);
+            // Where the filter is not sure of its pose, its height is not used either.
             let state = State::Searching;
-            assert!(known(&InitialEstimate { state, ..estimate }).is_none());
+            assert!(ground(&InitialEstimate { state, ..estimate }).is_none());
         }
     }
 
