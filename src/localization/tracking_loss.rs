@@ -179,8 +179,14 @@ impl AgreementMonitor {
         fast < config.min_agreement || fast < config.lost_fraction * slow
     }
 
-    /// Whether a share is nearer to a loss than to the usual one: the pose of its frame is not to be trusted, whatever the averages
-    /// say, as where the motion into it was not what the odometry found.
+    /// Whether a share is so far below the usual one that the pose of its frame is not to be trusted, whatever the averages
+    /// say: as where the motion into it was not what the odometry found.
+    pub fn is_far_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
+        let both = agreement.zip(self.slow);
+        both.is_some_and(|(share, slow)| share < config.lost_fraction * slow)
+    }
+
+    /// Whether a share is nearer to a loss than to the usual one.
     pub fn is_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
         let both = agreement.zip(self.slow);
         both.is_some_and(|(share, slow)| share < 0.5 * (1.0 + config.lost_fraction) * slow)
@@ -212,18 +218,24 @@ mod tests {
     }
 
     #[test]
-    fn a_share_nearer_to_a_loss_than_to_the_usual_one_is_noticed_and_a_first_one_is_not() {
+    fn a_share_far_below_the_usual_one_is_noticed_and_a_first_one_is_not() {
         let config = TrackingLossConfig::default();
         let mut monitor = AgreementMonitor::default();
+        assert!(!monitor.is_far_below_usual(Some(0.3), &config));
         assert!(!monitor.is_below_usual(Some(0.3), &config));
         for _ in 0..5 {
             monitor.observe(Some(0.96), &config);
         }
-        monitor.observe(Some(0.82), &config);
+        monitor.observe(Some(0.66), &config);
         // The averages see no loss yet.
-        assert!(!monitor.is_lost(&config) && monitor.is_below_usual(Some(0.82), &config));
+        assert!(!monitor.is_lost(&config) && monitor.is_far_below_usual(Some(0.66), &config));
+        assert!(
+            !monitor.is_far_below_usual(Some(0.8), &config)
+                && !monitor.is_far_below_usual(None, &config)
+        );
+        // Halfway to that.
         let is_below = |share| monitor.is_below_usual(share, &config);
-        assert!(!is_below(Some(0.85)) && !is_below(None));
+        assert!(is_below(Some(0.82)) && !is_below(Some(0.85)) && !is_below(None));
     }
 
     fn after(agreements: &[f64]) -> bool {

@@ -323,7 +323,7 @@ fn a_standing_car_is_compared_with_the_map_and_is_sure_only_of_what_it_sees() {
 }
 
 #[test]
-fn the_scan_of_a_standing_car_that_agrees_less_than_usual_is_used() {
+fn the_scan_of_a_standing_car_that_agrees_far_less_than_usual_is_used() {
     const USUAL: f64 = 0.98;
     let street = TestWorld::street();
     let start = street.pose_at(0.0, 0.0, 0.7);
@@ -345,7 +345,7 @@ fn the_scan_of_a_standing_car_that_agrees_less_than_usual_is_used() {
             continue;
         }
         let share = without.agreement.unwrap();
-        let is_low = share < 0.5 * (1.0 + config.lost_fraction) * USUAL;
+        let is_low = share < config.lost_fraction * USUAL;
         assert_eq!(step(Some(USUAL), turned_rad).updated, is_low, "{share}");
         between += usize::from(is_low);
     }
@@ -353,7 +353,7 @@ fn the_scan_of_a_standing_car_that_agrees_less_than_usual_is_used() {
 }
 
 #[test]
-fn the_pose_of_an_update_whose_scan_agrees_less_than_usual_is_not_sure() {
+fn the_pose_of_an_update_whose_scan_agrees_far_less_than_usual_is_not_sure() {
     const USUAL: f64 = 0.98;
     let street = TestWorld::street();
     let start = street.pose_at(0.0, 0.0, 0.7);
@@ -384,7 +384,7 @@ fn the_pose_of_an_update_whose_scan_agrees_less_than_usual_is_not_sure() {
         }
         let share = without.agreement.unwrap();
         let slow = USUAL + limits.slow_rate * (share - USUAL);
-        let is_low = share < 0.5 * (1.0 + limits.lost_fraction) * slow;
+        let is_low = share < limits.lost_fraction * slow;
         let is_tracked = step(Some(USUAL), turned_rad).state == State::Tracking;
         assert_eq!(is_tracked, !is_low, "{share}");
         low += usize::from(is_low);

@@ -87,9 +87,9 @@ impl ParticleFilter {
         }
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
-        let is_below_usual =
-            (self.agreement).is_below_usual(estimate.agreement, &self.config.tracking_loss);
-        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_below_usual;
+        let is_far_below_usual =
+            (self.agreement).is_far_below_usual(estimate.agreement, &self.config.tracking_loss);
+        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_far_below_usual;
         estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
@@ -179,7 +179,7 @@ impl ParticleFilter {
         coasted.agreement = self.agreement_at(&coasted.map_from_lidar, &beams, attitude)?;
         let (agreement, config) = (coasted.agreement, &self.config.tracking_loss);
         let contradicts = agreement.is_some_and(|share| share < config.min_agreement)
-            || self.agreement.is_below_usual(agreement, config);
+            || self.agreement.is_far_below_usual(agreement, config);
         if contradicts && self.phase == Phase::Tracking {
             return Ok(None);
         }
