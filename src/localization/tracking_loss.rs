@@ -182,14 +182,18 @@ impl AgreementMonitor {
     /// Whether a share is so far below the usual one that the pose of its frame is not to be trusted, whatever the averages
     /// say: as where the motion into it was not what the odometry found.
     pub fn is_far_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
-        let both = agreement.zip(self.slow);
-        both.is_some_and(|(share, slow)| share < config.lost_fraction * slow)
+        self.is_below(agreement, config.lost_fraction)
     }
 
     /// Whether a share is nearer to a loss than to the usual one.
     pub fn is_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
+        self.is_below(agreement, 0.5 * (1.0 + config.lost_fraction))
+    }
+
+    /// Whether a share is below a fraction of the slow average.
+    fn is_below(&self, agreement: Option<f64>, fraction: f64) -> bool {
         let both = agreement.zip(self.slow);
-        both.is_some_and(|(share, slow)| share < 0.5 * (1.0 + config.lost_fraction) * slow)
+        both.is_some_and(|(share, slow)| share < fraction * slow)
     }
 
     /// Whether a share confirms a pose that was uncertain: it is as large as usual here, or nearly all beams agree and it is

@@ -182,12 +182,6 @@ pub fn refine_frame(
     config: &FrameRefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<Option<RefinedFrame>, RenderError> {
-    // A swarm follows the mapped ground.
-    let known_ground = (objective.known_ground).filter(|_| config.method != Method::Swarm);
-    let objective = &FrameObjective {
-        known_ground,
-        ..*objective
-    };
     let reach = config.reach(covariance);
     let (objective, reach_m) = match distance {
         Distance::Far(_) => (*objective, reach[0].max(reach[1])),

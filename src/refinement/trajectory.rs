@@ -19,7 +19,7 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::objective::FrameObjective;
-use super::refiner::{Distance, FrameRefinementConfig, refine_frame};
+use super::refiner::{Distance, FrameRefinementConfig, Method, refine_frame};
 use super::smoothing::{self, FramePrior, smooth};
 use super::upright::UprightSurfaces;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose3_from_pose2};
@@ -175,6 +175,11 @@ impl From<&Estimate> for InitialEstimate {
 }
 
 impl InitialEstimate {
+    /// Pose in space of a tracked frame, where it is known.
+    fn tracked_in_space(&self) -> Option<Pose3> {
+        (self.map_from_lidar).filter(|_| self.state == State::Tracking)
+    }
+
     fn covariance(&self) -> Matrix3<f64> {
         let default = || Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 1e-4));
         self.covariance.unwrap_or_else(default)
@@ -222,8 +227,8 @@ pub struct RefinedTrajectory {
     pub covariances: Vec<Matrix3<f64>>,
     /// Frames that the filter did not track and that could not be placed from their neighbours.
     pub untracked: usize,
-    /// Tracked frames that were not refined because there is no mapped ground under the car, and too few beams meet the map or
-    /// the pose in space is not known, or no beam is in the scan.
+    /// Tracked frames that were not refined because there is no mapped ground under the car, and without it their scans do not
+    /// determine the pose, or no beam is in the scan.
     pub unmapped: usize,
     /// Whether the trajectory was smoothed.
     pub is_smoothed: bool,
@@ -360,11 +365,10 @@ impl TrajectoryRefiner {
         let image = self.preparation.range_image(scan, estimate.motion.as_ref());
         let previous = self.frames.last();
         let mapped = self.mapped_ground_of(estimate)?;
-        let known = self.in_space(estimate);
-        let assumed = known.map(|map_from_lidar| self.assumed_ground(&map_from_lidar));
-        let ground = mapped.or(assumed);
-        let attitude =
-            (known.zip(ground)).map(|(map_from_lidar, ground)| ground.attitude_of(&map_from_lidar));
+        let known = estimate.tracked_in_space().map(|map_from_lidar| {
+            let ground = mapped.unwrap_or_else(|| self.assumed_ground(&map_from_lidar));
+            (ground, ground.attitude_of(&map_from_lidar))
+        });
         let level_before_m = previous
             .filter(|_| estimate.state != State::Lost)
             .and_then(|previous| previous.level_m);
@@ -374,8 +378,8 @@ impl TrajectoryRefiner {
             covariance: estimate.covariance(),
             state: estimate.state,
             change: None,
-            attitude: attitude.unwrap_or_else(|| self.initial_attitude(&image)),
-            ground,
+            attitude: known.map_or_else(|| self.initial_attitude(&image), |(_, attitude)| attitude),
+            ground: known.map(|(ground, _)| ground),
             level_m: mapped.map(|ground| ground.height_m).or(level_before_m),
         };
         let is_tracked = frame.is_tracked();
@@ -471,19 +475,13 @@ impl TrajectoryRefiner {
         Ok(())
     }
 
-    /// Pose in space of a tracked frame, where it is known.
-    fn in_space(&self, estimate: &InitialEstimate) -> Option<Pose3> {
-        let is_tracked = estimate.state == State::Tracking;
-        estimate.map_from_lidar.filter(|_| is_tracked)
-    }
-
     /// The mapped ground below the estimate of a tracked frame that is known in space; `None` for other frames and where the map has
     /// none.
     fn mapped_ground_of(
         &self,
         estimate: &InitialEstimate,
     ) -> Result<Option<GroundPatch>, RenderError> {
-        let Some(map_from_lidar) = self.in_space(estimate) else {
+        let Some(map_from_lidar) = estimate.tracked_in_space() else {
             return Ok(None);
         };
         let place = map_from_lidar.translation;
@@ -552,7 +550,8 @@ impl TrajectoryRefiner {
             registered: &registered,
             level_m: frame.level_m,
             attitude: frame.attitude,
-            known_ground: frame.ground,
+            // A swarm follows the mapped ground.
+            known_ground: (frame.ground).filter(|_| self.config.refinement.method != Method::Swarm),
             difference: observation.difference(),
         };
         if frame.level_m.is_none() && frame.ground.is_none() {
@@ -763,7 +762,6 @@ mod tests {
     use approx::assert_relative_eq;
     use nalgebra::UnitQuaternion;
 
-    use super::super::refiner::Method;
     use super::*;
     use crate::geometry::pose2_from_pose3;
     use crate::lidar::LidarModel;

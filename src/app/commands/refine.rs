@@ -379,7 +379,7 @@ fn report_unrefined(refined: &RefinedTrajectory, is_trajectory: bool) {
     }
     if refined.unmapped > 0 {
         tracing::warn!(
-            "{} frames are not refined{smoothed}: there is no mapped ground under the car, and too few beams meet the map or the pose in space is not known; or the scan has no beam",
+            "{} frames are not refined{smoothed}: there is no mapped ground under the car, and without it their scans do not determine the pose, or the scans have no beams",
             refined.unmapped
         );
     }

@@ -27,7 +27,8 @@ impl ParticleFilter {
         };
         let ground = self.ground_at(&pose)?;
         let attitude = attitude_above(&ground, self.predicted, attitude);
-        self.estimate_of(pose, particles, covariance, (&attitude, None))
+        let in_space = self.lift(&pose, &attitude, None)?;
+        self.estimate_of(pose, particles, covariance, in_space)
     }
 
     /// Covariance of the last estimate, propagated by the motion since then [m², m·rad, rad²]:

@@ -511,7 +511,8 @@ fn the_motion_between_updates_is_known_if_the_pose_was_certain_at_both() {
             pose: None,
             refutes,
         };
-        filter.updated_estimate(&update, None).unwrap();
+        let compared = filter.compared(&update).unwrap();
+        filter.updated_estimate(&update, compared).unwrap();
         filter.last_motion.map(|last| last.increment)
     };
     let motion = |was_narrow: bool, apart_m: f64| motion_of(was_narrow, apart_m, [false; 2]);

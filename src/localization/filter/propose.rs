@@ -390,7 +390,7 @@ mod tests {
             let prior = Gaussian::new(pose, nalgebra::Matrix3::identity() * 1e-4).unwrap();
             let mut rng = StdRng::seed_from_u64(1);
             let mut filter = tracking(&world, &prior, &mut rng);
-            let lifted = filter.lift(&pose, &attitude, None).unwrap();
+            let lifted = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
             let found = filter.propose_elsewhere(&scan, &attitude, &lifted, &mut rng);
             let found = found.unwrap().map(|found| found.gaussian.mean);
             assert_eq!(found.is_some(), off_m != 0.0, "{off_m}");

@@ -2,7 +2,7 @@
 
 use rand::Rng;
 
-use super::state::{LastMotion, ParticleFilter, Updated};
+use super::state::{InSpace, LastMotion, ParticleFilter, Updated};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::estimate::Estimate;
@@ -26,6 +26,13 @@ pub(super) struct Update {
     pub(super) pose: Option<Pose2>,
     /// Whether the scan shows that the prediction is wrong, or replaces one that no scan confirmed.
     pub(super) refutes: bool,
+}
+
+/// The pose of an update in space, and its agreement with the map.
+#[derive(Clone, Copy)]
+pub(super) struct Compared {
+    pub in_space: InSpace,
+    pub agreement: Option<f64>,
 }
 
 impl ParticleFilter {
@@ -113,7 +120,7 @@ impl ParticleFilter {
     pub(super) fn updated_estimate(
         &mut self,
         update: &Update,
-        agreement: Option<f64>,
+        compared: Compared,
     ) -> Result<Estimate, RenderError> {
         let pose = update.pose.unwrap_or_else(|| self.particles.mean());
         let covariance = match update.pose {
@@ -121,14 +128,9 @@ impl ParticleFilter {
             None => self.particles.covariance_of_estimate(),
         };
         let particles = self.particles.clone();
-        let mut estimate = self.estimate_of(
-            pose,
-            particles,
-            covariance,
-            (&update.attitude, update.ground),
-        )?;
+        let mut estimate = self.estimate_of(pose, particles, covariance, compared.in_space)?;
         estimate.updated = true;
-        estimate.agreement = agreement;
+        estimate.agreement = compared.agreement;
         estimate.mean_cost_m = update.mean_cost_m;
         let is_narrow = self.is_narrow();
         // A jump of a wide distribution is not a motion of the car, nor is the correction of a refuted prediction. One that follows

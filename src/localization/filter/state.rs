@@ -167,30 +167,21 @@ impl ParticleFilter {
         Ok(Some(ground.attitude_of(&map_from_lidar)))
     }
 
-    /// Estimate of a frame at a pose, of which the attitude is above `ground`, by default the ground below it or, without any, the last
-    /// known one. `covariance` is without the error of the map, which is added.
+    /// Estimate of a frame at a pose and in space there, which is kept. `covariance` is without the error of the map, which is added.
     pub(super) fn estimate_of(
         &mut self,
         pose: Pose2,
         particles: ParticleSet,
         covariance: Matrix3<f64>,
-        (attitude, ground): (&SensorAttitude, Option<GroundPatch>),
+        in_space: InSpace,
     ) -> Result<Estimate, RenderError> {
-        let map_from_lidar = self.lift(&pose, attitude, ground)?;
         let found = self.patch_at(&pose)?;
         self.patch = found.or(self.patch);
-        let in_space = InSpace {
-            map_from_lidar,
-            attitude: match ground {
-                Some(_) => self.patch.unwrap_or_default().attitude_of(&map_from_lidar),
-                None => *attitude,
-            },
-        };
         self.in_space = Some(in_space);
         let covariance = covariance + self.config.proposal.registration.of_map();
         Ok(Estimate {
             pose,
-            map_from_lidar,
+            map_from_lidar: in_space.map_from_lidar,
             attitude: in_space.attitude,
             level_m: self.patch.map(|patch| patch.height_m),
             covariance,
@@ -206,29 +197,23 @@ impl ParticleFilter {
         })
     }
 
-    /// Moves the last estimate in height, roll and pitch to a pose in space.
-    pub(super) fn move_in_space(&mut self, estimate: &mut Estimate, map_from_lidar: Pose3) {
-        let attitude = (self.patch.unwrap_or_default()).attitude_of(&map_from_lidar);
-        self.in_space = Some(InSpace {
-            map_from_lidar,
-            attitude,
-        });
-        estimate.map_from_lidar = map_from_lidar;
-        estimate.attitude = attitude;
-    }
-
     /// A pose in space, by the attitude of the sensor above `ground` or, without that, above the ground below it.
     pub(super) fn lift(
         &self,
         pose: &Pose2,
         attitude: &SensorAttitude,
         ground: Option<GroundPatch>,
-    ) -> Result<Pose3, RenderError> {
-        let ground = match ground {
-            Some(ground) => ground,
-            None => self.ground_at(pose)?,
+    ) -> Result<InSpace, RenderError> {
+        let below = self.ground_at(pose)?;
+        let map_from_lidar = ground.unwrap_or(below).lift(pose, attitude);
+        let attitude = match ground {
+            Some(_) => below.attitude_of(&map_from_lidar),
+            None => *attitude,
         };
-        Ok(ground.lift(pose, attitude))
+        Ok(InSpace {
+            map_from_lidar,
+            attitude,
+        })
     }
 
     /// The ground below a pose, or the last known one.

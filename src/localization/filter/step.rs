@@ -6,7 +6,7 @@ use nalgebra::Matrix3;
 use rand::Rng;
 
 use super::phase::{Evidence, Phase, Search};
-use super::reweight::Update;
+use super::reweight::{Compared, Update};
 use super::state::{ParticleFilter, Pending};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, PERIOD_S, RangeImage};
@@ -50,34 +50,38 @@ impl ParticleFilter {
             Some(posterior) => self.sample(posterior, rng),
             None => self.reweight_widely(scan, attitude, rng)?,
         };
-        let (mut map_from_lidar, mut agreement) = self.compared(&update)?;
+        let mut compared = self.compared(&update)?;
         if let Some(predicted) = predicted
-            && (self.agreement).is_below_usual(agreement, &self.config.tracking_loss)
+            && (self.agreement).is_below_usual(compared.agreement, &self.config.tracking_loss)
         {
             let updated = mem::replace(&mut self.particles, predicted);
-            match self.propose_elsewhere(scan, &update.attitude, &map_from_lidar, rng)? {
+            let here = compared.in_space.map_from_lidar;
+            match self.propose_elsewhere(scan, &update.attitude, &here, rng)? {
                 Some(elsewhere) => {
                     update = self.sample(elsewhere, rng);
-                    (map_from_lidar, agreement) = self.compared(&update)?;
+                    compared = self.compared(&update)?;
                 }
                 None => self.particles = updated,
             }
         }
-        let mut estimate = self.updated_estimate(&update, agreement)?;
+        let mut estimate = self.updated_estimate(&update, compared)?;
         let mut evidence = self.evidence(&estimate, odometry, update.refutes);
         let is_found = evidence.is_confirmed && !self.phase.is_tracking();
-        let found_at = (&update.attitude, Some(map_from_lidar));
+        let found_at = (&update.attitude, Some(estimate.map_from_lidar));
         if is_found && let Some(posterior) = self.propose(scan, found_at, None, rng)? {
             if posterior.refutes {
                 update = self.sample(posterior, rng);
-                (_, agreement) = self.compared(&update)?;
-                estimate = self.updated_estimate(&update, agreement)?;
+                let compared = self.compared(&update)?;
+                estimate = self.updated_estimate(&update, compared)?;
             } else {
                 // The scan was used for the planar pose. Height, roll and pitch are those of the registration where they fit.
-                let there = posterior.ground.lift(&estimate.pose, &posterior.attitude);
-                let share = self.agreement_at(&there, &update.beams, &posterior.attitude)?;
-                if share >= agreement {
-                    self.move_in_space(&mut estimate, there);
+                let (attitude, ground) = (&posterior.attitude, Some(posterior.ground));
+                let there = self.lift(&estimate.pose, attitude, ground)?;
+                let share = self.agreement_at(&there.map_from_lidar, &update.beams, attitude)?;
+                if share >= estimate.agreement {
+                    self.in_space = Some(there);
+                    estimate.map_from_lidar = there.map_from_lidar;
+                    estimate.attitude = there.attitude;
                     estimate.agreement = share;
                 }
             }
@@ -103,12 +107,15 @@ impl ParticleFilter {
         self.phase.is_unconfirmed() && is_one_place && self.is_narrow()
     }
 
-    /// The pose of an update in space, and its agreement with the map.
-    fn compared(&self, update: &Update) -> Result<(Pose3, Option<f64>), RenderError> {
+    /// Compares the pose of an update with the map.
+    pub(super) fn compared(&self, update: &Update) -> Result<Compared, RenderError> {
         let pose = update.pose.unwrap_or_else(|| self.particles.mean());
-        let map_from_lidar = self.lift(&pose, &update.attitude, update.ground)?;
-        let agreement = self.agreement_at(&map_from_lidar, &update.beams, &update.attitude)?;
-        Ok((map_from_lidar, agreement))
+        let in_space = self.lift(&pose, &update.attitude, update.ground)?;
+        let map_from_lidar = &in_space.map_from_lidar;
+        Ok(Compared {
+            in_space,
+            agreement: self.agreement_at(map_from_lidar, &update.beams, &update.attitude)?,
+        })
     }
 
     /// Adds the motion into a frame to the motion since the last update.

@@ -65,7 +65,7 @@ impl SensorAttitude {
     }
 }
 
-/// Plane of the ground around a point; by default that of the map's x and y.
+/// Plane of the ground around a point; by default the plane z = 0 of the map.
 #[derive(Clone, Copy, Debug, PartialEq, SmartDefault)]
 pub struct GroundPatch {
     /// Height at the point, map frame [m].
