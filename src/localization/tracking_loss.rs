@@ -4,9 +4,13 @@
 //! by a fast and a slow average,
 //!
 //! ```text
-//! fast ← fast + α_fast (a − fast)      slow ← slow + α_slow (a − slow)
+//! fast ← fast + α_fast (a − fast)      slow ← slow + max(α_slow, 1/n) (a − slow)
 //! lost  ⇔  fast < min_agreement  ∨  fast < lost_fraction · slow
 //! ```
+//!
+//! with the n-th share a; the rate is α_slow for a share that is halfway to a loss, so that the slow average, the usual share, begins as
+//! the mean of the shares of right poses. A single share below the usual one by a quarter of the way to a loss may be that of a pose next to
+//! the right one, which is then looked for. One that is halfway there or, of the first ten, all the way is not to be trusted.
 //!
 //! A place that was found by a search is confirmed by the share of one scan if nearly all of its beams agree, else by
 //! those of several scans in turn: many places agree with a single scan of few beams. A pose that was uncertain in
@@ -71,7 +75,7 @@ pub struct TrackingLossConfig {
     /// Weight of a new frame in the fast average, α_fast.
     #[default(0.4)]
     pub fast_rate: f64,
-    /// Weight of a new frame in the slow average, α_slow.
+    /// Weight of a new frame in the slow average, α_slow; of the first frames it is their mean.
     #[default(0.02)]
     pub slow_rate: f64,
     /// Tracking is lost below this share of agreeing beams (unitless).
@@ -129,11 +133,16 @@ impl Validate for TrackingLossConfig {
     }
 }
 
+/// Part of the way from the usual share to a loss, beyond which a share is nearer to the loss.
+const HALFWAY: f64 = 0.5;
+
 /// Averages of the share of agreeing beams.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct AgreementMonitor {
     fast: Option<f64>,
     slow: Option<f64>,
+    /// Shares in these.
+    observed: usize,
     /// Updates in turn that agree with a place that was found.
     confirming: usize,
 }
@@ -144,12 +153,19 @@ impl AgreementMonitor {
         let Some(agreement) = agreement else {
             return;
         };
+        self.observed += 1;
+        let mean_rate = 1.0 / self.observed as f64;
+        let slow_rate = if self.is_below_usual(Some(agreement), HALFWAY, config) {
+            config.slow_rate
+        } else {
+            config.slow_rate.max(mean_rate)
+        };
         let follow = |average: &mut Option<f64>, rate: f64| {
             let before = average.unwrap_or(agreement);
             *average = Some(before + rate * (agreement - before));
         };
         follow(&mut self.fast, config.fast_rate);
-        follow(&mut self.slow, config.slow_rate);
+        follow(&mut self.slow, slow_rate);
     }
 
     /// Whether the place is confirmed to which the filter has converged, or not, in this update. What is not compared
@@ -179,19 +195,40 @@ impl AgreementMonitor {
         fast < config.min_agreement || fast < config.lost_fraction * slow
     }
 
-    /// Whether a share is so far below the usual one that the pose of its frame is not to be trusted, whatever the averages
-    /// say: as where the motion into it was not what the odometry found.
+    /// Whether a share is below the usual one as far as the fast average is where tracking is lost: the motion into the frame was not
+    /// what the odometry found.
     pub fn is_far_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
-        self.is_below(agreement, config.lost_fraction)
+        self.is_below_usual(agreement, 1.0, config)
     }
 
-    /// Whether a share is nearer to a loss than to the usual one.
-    pub fn is_below_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
-        self.is_below(agreement, 0.5 * (1.0 + config.lost_fraction))
+    /// Whether a frame with a share is not to be called tracking: the share is nearer to a loss than to the usual one or, as long as
+    /// that is the mean of few shares, far below it.
+    pub fn is_doubtful(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
+        /// Shares whose mean has a third of the standard deviation of one.
+        const MANY: usize = 10;
+        let way = if self.observed < MANY { 1.0 } else { HALFWAY };
+        self.is_below_usual(agreement, way, config)
     }
 
-    /// Whether a share is below a fraction of the slow average.
-    fn is_below(&self, agreement: Option<f64>, fraction: f64) -> bool {
+    /// Whether a share is so low that the pose of its frame may be another one around the prediction.
+    pub fn suggests_another_pose(
+        &self,
+        agreement: Option<f64>,
+        config: &TrackingLossConfig,
+    ) -> bool {
+        /// Of the way to a loss.
+        const WAY: f64 = 0.25;
+        self.is_below_usual(agreement, WAY, config)
+    }
+
+    /// Whether a share is below the usual one by more than a part of the way to a loss.
+    fn is_below_usual(
+        &self,
+        agreement: Option<f64>,
+        way: f64,
+        config: &TrackingLossConfig,
+    ) -> bool {
+        let fraction = 1.0 - way * (1.0 - config.lost_fraction);
         let both = agreement.zip(self.slow);
         both.is_some_and(|(share, slow)| share < fraction * slow)
     }
@@ -201,7 +238,7 @@ impl AgreementMonitor {
     pub fn is_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
         agreement.is_some_and(|share| {
             let is_sure = share >= config.sure_agreement;
-            let is_near = !self.is_below_usual(agreement, config);
+            let is_near = !self.is_below_usual(agreement, HALFWAY, config);
             (self.slow).is_none_or(|slow| share >= slow || is_sure && is_near)
         })
     }
@@ -225,21 +262,58 @@ mod tests {
     fn a_share_far_below_the_usual_one_is_noticed_and_a_first_one_is_not() {
         let config = TrackingLossConfig::default();
         let mut monitor = AgreementMonitor::default();
-        assert!(!monitor.is_far_below_usual(Some(0.3), &config));
-        assert!(!monitor.is_below_usual(Some(0.3), &config));
-        for _ in 0..5 {
-            monitor.observe(Some(0.96), &config);
+        let judge = |monitor: &AgreementMonitor, share| {
+            let is_far = monitor.is_far_below_usual(share, &config);
+            let is_doubtful = monitor.is_doubtful(share, &config);
+            let is_another = monitor.suggests_another_pose(share, &config);
+            [is_far, is_doubtful, is_another]
+        };
+        assert_eq!(judge(&monitor, Some(0.3)), [false; 3]);
+        for share in [1.0, 0.9, 0.98, 0.92, 0.95] {
+            monitor.observe(Some(share), &config);
         }
-        monitor.observe(Some(0.66), &config);
+        monitor.observe(Some(0.65), &config);
+        // The mean of the five, and a fiftieth of the way to the last.
+        let usual = 0.944;
         // The averages see no loss yet.
-        assert!(!monitor.is_lost(&config) && monitor.is_far_below_usual(Some(0.66), &config));
-        assert!(
-            !monitor.is_far_below_usual(Some(0.8), &config)
-                && !monitor.is_far_below_usual(None, &config)
-        );
-        // Halfway to that.
-        let is_below = |share| monitor.is_below_usual(share, &config);
-        assert!(is_below(Some(0.82)) && !is_below(Some(0.85)) && !is_below(None));
+        assert!(!monitor.is_lost(&config));
+        let is_known = |number: usize| number >= 10;
+        for number in 6..=12 {
+            for (below, expected) in [
+                (0.26, [true, true, true]),
+                (0.24, [false, is_known(number), true]),
+                (0.13, [false, is_known(number), true]),
+                (0.12, [false, false, true]),
+                (0.065, [false, false, true]),
+                (0.06, [false, false, false]),
+                (-0.1, [false, false, false]),
+            ] {
+                let share = (1.0 - below) * usual;
+                assert_eq!(judge(&monitor, Some(share)), expected, "{number}: {below}");
+            }
+            assert_eq!(judge(&monitor, None), [false; 3]);
+            monitor.observe(Some(usual), &config);
+        }
+    }
+
+    #[test]
+    fn the_usual_share_is_the_mean_of_the_first_ones_that_are_near_it_and_follows_slowly() {
+        let config = TrackingLossConfig::default();
+        let mut monitor = AgreementMonitor::default();
+        for number in 1..=50 {
+            monitor.observe(Some(if number % 2 == 0 { 0.9 } else { 0.94 }), &config);
+        }
+        assert!((monitor.slow.unwrap() - 0.92).abs() < 1e-9);
+        monitor.observe(Some(0.82), &config);
+        assert!((monitor.slow.unwrap() - 0.918).abs() < 1e-9);
+        // A wrong pose after few scans does not become usual before it is lost.
+        let mut wrong = AgreementMonitor::default();
+        let shares = [0.95; 3].into_iter().chain([0.65; 7]);
+        let is_lost = |share| {
+            wrong.observe(Some(share), &config);
+            wrong.is_lost(&config)
+        };
+        assert_eq!(shares.map(is_lost).position(|is_lost| is_lost), Some(6));
     }
 
     fn after(agreements: &[f64]) -> bool {

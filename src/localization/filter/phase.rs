@@ -26,7 +26,8 @@
 //! Without panoramas the filter stays `Lost` until a pose is confirmed. What is reported, see [`Phase::reported`]:
 //!
 //! ```text
-//! Searching  searching          Tracking  tracking; searching while the position is not precise, or nothing is compared
+//! Searching  searching          Tracking  tracking; searching while the position is not precise, nothing is compared, or much less
+//!                                         than usual agrees
 //! Uncertain  searching          Lost      lost
 //! ```
 
@@ -140,8 +141,8 @@ impl Phase {
         }
     }
 
-    /// The state of a frame; `is_sure`: its position is precise, which the odometry changes between updates, and its scan was
-    /// compared with the map.
+    /// The state of a frame; `is_sure`: its position is precise, which the odometry changes between updates, its scan was
+    /// compared with the map, and their agreement is not doubtful.
     pub fn reported(self, is_sure: bool) -> State {
         match self {
             Self::Tracking if is_sure => State::Tracking,

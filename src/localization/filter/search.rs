@@ -23,6 +23,9 @@ use crate::rendering::RenderError;
 /// Number of beams that are registered at a place.
 pub(super) const PLACE_BEAMS: usize = 800;
 
+/// Distance between poses from which a registration with a wide kernel starts [m].
+pub(super) const APART_M: f64 = 1.0;
+
 /// A place where the car may be.
 struct PlaceHypothesis {
     /// Registered pose where registration succeeded, else that of a particle.
@@ -111,8 +114,6 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Vec<usize>, RenderError> {
-        /// Distance between optima [m].
-        const APART_M: f64 = 1.0;
         let observation = &self.config.observation;
         let count = observation.beams_for(self.particles.len());
         let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
@@ -230,7 +231,10 @@ impl ParticleFilter {
 }
 
 /// Covariance of the pose in a place: that of its registration, if any, and at most as wide as the place.
-fn within_place(registered: Option<Matrix3<f64>>, radius_m: f64) -> Option<Matrix3<f64>> {
+pub(super) fn within_place(
+    registered: Option<Matrix3<f64>>,
+    radius_m: f64,
+) -> Option<Matrix3<f64>> {
     /// Standard deviations: of the position in radii, and of the heading [rad].
     const SHARE: f64 = 0.5;
     const TURN_RAD: f64 = 0.2;

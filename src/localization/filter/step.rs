@@ -52,11 +52,12 @@ impl ParticleFilter {
         };
         let mut compared = self.compared(&update)?;
         if let Some(predicted) = predicted
-            && (self.agreement).is_below_usual(compared.agreement, &self.config.tracking_loss)
+            && (self.agreement)
+                .suggests_another_pose(compared.agreement, &self.config.tracking_loss)
         {
             let updated = mem::replace(&mut self.particles, predicted);
             let here = compared.in_space.map_from_lidar;
-            match self.propose_elsewhere(scan, &update.attitude, &here, rng)? {
+            match self.propose_elsewhere(scan, (attitude, self.predicted), &here, rng)? {
                 Some(elsewhere) => {
                     update = self.sample(elsewhere, rng);
                     compared = self.compared(&update)?;
@@ -91,9 +92,9 @@ impl ParticleFilter {
         }
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
-        let is_far_below_usual =
-            (self.agreement).is_far_below_usual(estimate.agreement, &self.config.tracking_loss);
-        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_far_below_usual;
+        let is_doubtful =
+            (self.agreement).is_doubtful(estimate.agreement, &self.config.tracking_loss);
+        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_doubtful;
         estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
@@ -190,7 +191,8 @@ impl ParticleFilter {
         if contradicts && self.phase == Phase::Tracking {
             return Ok(None);
         }
-        let is_sure = self.is_precise(&coasted.covariance) && agreement.is_some() && !contradicts;
+        let is_doubtful = contradicts || self.agreement.is_doubtful(agreement, config);
+        let is_sure = self.is_precise(&coasted.covariance) && agreement.is_some() && !is_doubtful;
         coasted.state = self.phase.reported(is_sure);
         Ok(Some(coasted))
     }
