@@ -25,6 +25,7 @@ use common::skips::skipped;
 use common::{COMPARISON_OF_STREET, Recording, copy_into};
 use fpmcl::internals::app::LocalizationResults;
 use rand::RngExt as _;
+use rayon::prelude::*;
 
 /// A command, and the call that prepares its inputs.
 struct Stage {
@@ -620,15 +621,16 @@ fn assert_nothing_is_wrong(rows: &[Row]) {
 
 #[test]
 fn a_command_that_is_stopped_gives_the_same_results_when_it_runs_again() {
-    print_head();
-    let mut all = Vec::new();
-    for stage in STAGES {
+    let rows_of = |stage| {
         let reference = Reference::new(stage);
         let mut rows = stop_at_random_moments(&reference, 3);
         rows.push(start_twice(&reference, 1));
-        rows.iter().for_each(Row::print);
-        all.extend(rows);
-    }
+        rows
+    };
+    // Several at a time: a command that waits or is being stopped leaves cores idle.
+    let all: Vec<Row> = STAGES.par_iter().flat_map_iter(rows_of).collect();
+    print_head();
+    all.iter().for_each(Row::print);
     assert_nothing_is_wrong(&all);
 }
 

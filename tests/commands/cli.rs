@@ -79,14 +79,6 @@ fn the_doctor_prints_threads_and_backend() {
     assert!(!stdout.contains("per second"), "{stdout}");
 }
 
-#[test]
-fn the_doctor_measures_rays_per_second() {
-    let stdout = fpmcl("doctor").with("--measure=1").succeeds().stdout;
-    let row = stdout.lines().find(|line| line.starts_with("rays "));
-    let number = row.and_then(|row| row.split_whitespace().nth(1)).unwrap();
-    assert!(number.parse::<f64>().unwrap() > 0.0, "{stdout}");
-}
-
 // Configurations.
 
 #[test]

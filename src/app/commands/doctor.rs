@@ -358,3 +358,18 @@ fn instruction_sets() -> Vec<&'static str> {
         .filter_map(|(name, is_available)| is_available.then_some(name))
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::map::world_for_tests::TestWorld;
+
+    #[test]
+    fn a_speed_is_in_rays_per_second_with_the_time_of_one_image() {
+        let world = TestWorld::street();
+        let speed = Speed::new(&world, "images cast".to_owned(), 2e6, 57_600, " per image");
+        let text = "2.00 M per second, images cast, 28.80 ms per image by boxes";
+        assert_eq!(speed.text, text);
+        assert_eq!(speed.ms, 28.8);
+    }
+}
