@@ -75,7 +75,7 @@ pub struct TrackingLossConfig {
     /// Weight of a new frame in the fast average, α_fast.
     #[default(0.4)]
     pub fast_rate: f64,
-    /// Weight of a new frame in the slow average, α_slow; of the first frames it is their mean.
+    /// Weight of a new frame in the slow average, α_slow; that average begins as the mean of the first frames.
     #[default(0.02)]
     pub slow_rate: f64,
     /// Tracking is lost below this share of agreeing beams (unitless).
@@ -141,7 +141,7 @@ const HALFWAY: f64 = 0.5;
 pub struct AgreementMonitor {
     fast: Option<f64>,
     slow: Option<f64>,
-    /// Shares in these.
+    /// Number of shares in the averages.
     observed: usize,
     /// Updates in turn that agree with a place that was found.
     confirming: usize,
@@ -204,7 +204,7 @@ impl AgreementMonitor {
     /// Whether a frame with a share is not to be called tracking: the share is nearer to a loss than to the usual one or, as long as
     /// that is the mean of few shares, far below it.
     pub fn is_doubtful(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
-        /// Shares whose mean has a third of the standard deviation of one.
+        /// Number of shares whose mean has a third of the standard deviation of a single one.
         const MANY: usize = 10;
         let way = if self.observed < MANY { 1.0 } else { HALFWAY };
         self.is_below_usual(agreement, way, config)
@@ -216,7 +216,7 @@ impl AgreementMonitor {
         agreement: Option<f64>,
         config: &TrackingLossConfig,
     ) -> bool {
-        /// Of the way to a loss.
+        /// Part of the way to a loss.
         const WAY: f64 = 0.25;
         self.is_below_usual(agreement, WAY, config)
     }

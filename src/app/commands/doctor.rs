@@ -371,5 +371,21 @@ mod tests {
         let text = "2.00 M per second, images cast, 28.80 ms per image by boxes";
         assert_eq!(speed.text, text);
         assert_eq!(speed.ms, 28.8);
+        let report = MachineReport {
+            fpmcl: "",
+            system: "",
+            architecture: "",
+            instruction_sets: Vec::new(),
+            processors: None,
+            threads: 1,
+            has_graphics_support: false,
+            adapters: Vec::new(),
+            backend_auto: String::new(),
+            backend_reason: String::new(),
+            speeds: vec![speed],
+            weights: None,
+        };
+        let row = format!("rays              {text}\n");
+        assert!(report.to_text().ends_with(&row), "{}", report.to_text());
     }
 }

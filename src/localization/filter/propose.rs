@@ -25,9 +25,6 @@ use crate::rendering::RenderError;
 /// one in 13 million is beyond 6, so that one farther off is no error of the prediction.
 const MAX_SIGMAS: f64 = 6.0;
 
-/// Beams that are compared at each pose from which a registration may start.
-const START_BEAMS: usize = 100;
-
 /// Where a registration may lead.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Basin {
@@ -133,7 +130,7 @@ impl ParticleFilter {
         }))
     }
 
-    /// [`propose`](Self::propose) and the others.
+    /// Registers the scan in a basin, and fuses the result with the prediction.
     fn propose_in(
         &self,
         scan: &RangeImage,
@@ -166,13 +163,8 @@ impl ParticleFilter {
             Basin::Place { is_searched } => {
                 let mut starts = vec![predicted];
                 if is_searched {
-                    let some = returns.choose(START_BEAMS, config.road_share, rng);
-                    starts.extend(self.starts_around(
-                        &mean,
-                        (scan, &some),
-                        (&patch, attitude),
-                        rng,
-                    )?);
+                    let above = (&patch, attitude);
+                    starts.extend(self.starts_around(&mean, (scan, &returns), above, rng)?);
                 }
                 self.best_registered(&starts, &mean, scan, (&registered, &beams))?
             }
@@ -224,18 +216,23 @@ impl ParticleFilter {
         }))
     }
 
-    /// The best of many poses in the place of a pose, at least a metre apart, at the height and the attitude above its ground.
+    /// Poses in the place of a pose with which a scan is most consistent, at least a metre apart, each at the height and the attitude of the
+    /// sensor above the ground.
     fn starts_around(
         &self,
         place: &Pose2,
-        scan_and_beams: (&RangeImage, &[Beam]),
+        (scan, returns): (&RangeImage, &ClassifiedReturns),
         (patch, attitude): (&GroundPatch, &SensorAttitude),
         rng: &mut impl Rng,
     ) -> Result<Vec<Pose3>, RenderError> {
-        /// Poses that are compared: in a place of 5 m, of two standard deviations one per half a metre and tenth of a radian.
+        /// Number of poses that are compared with the scan: within two standard deviations in a place of 5 m one per half a metre and
+        /// tenth of a radian.
         const POSES: usize = 2000;
-        /// Poses that are returned.
+        /// Number of beams of each comparison.
+        const BEAMS: usize = 100;
+        /// Largest number of poses that are returned.
         const STARTS: usize = 8;
+        let beams = returns.choose(BEAMS, self.config.proposal.road_share, rng);
         let radius_m = self.config.places.radius_m;
         let covariance = within_place(None, radius_m);
         let Some(around) = covariance.and_then(|it| Gaussian::new(*place, it)) else {
@@ -249,13 +246,13 @@ impl ParticleFilter {
         };
         let lifted: Vec<Option<Pose3>> = poses.iter().map(lift).collect();
         let observation = &self.config.observation;
-        let costs_m = costs_of_scan(&*self.map.renderer, &lifted, scan_and_beams, observation)?;
+        let costs_m = costs_of_scan(&*self.map.renderer, &lifted, (scan, &beams), observation)?;
         let best = best_of_each(&poses, &costs_m, STARTS, APART_M);
         Ok(best.into_iter().filter_map(|index| lifted[index]).collect())
     }
 
-    /// The pose to which beams are registered in a place from some starts, of least cost, or next to the place of those whose costs
-    /// differ by no more than decides; `None` where all fail.
+    /// The best of the poses to which beams are registered from some starts in a place: of those whose costs exceed the least by no more
+    /// than the tolerance of places, the nearest to the centre of the place. `None` if no registration succeeds.
     fn best_registered(
         &self,
         starts: &[Pose3],
@@ -490,6 +487,31 @@ mod tests {
             assert_relative_eq!(frame.pose, truth, epsilon = 5e-3);
             let is_confirmed = frame.state == State::Tracking;
             assert_eq!(is_confirmed, off_m == 0.0, "{off_m}");
+        }
+    }
+
+    #[test]
+    fn starts_on_a_slope_are_at_the_height_of_the_sensor_above_it() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        let prior = Gaussian::new(truth, nalgebra::Matrix3::identity() * 1e-4).unwrap();
+        let mut rng = StdRng::seed_from_u64(1);
+        let filter = tracking(&world, &prior, &mut rng);
+        let slope = GroundPatch {
+            height_m: 0.0,
+            normal: Vector3::new(-0.1, 0.05, 1.0).normalize(),
+        };
+        let returns = ClassifiedReturns::new(&scan, &attitude);
+        let above = (&slope, &attitude);
+        let starts = filter.starts_around(&truth, (&scan, &returns), above, &mut rng);
+        let starts = starts.unwrap();
+        assert!(starts.len() > 1);
+        for start in starts {
+            let shift_m = start.translation.vector.xy() - truth.translation.vector;
+            let height_m = start.translation.z - (0.1 * shift_m.x - 0.05 * shift_m.y);
+            let expected_m = attitude.height_m / slope.normal.z;
+            assert_relative_eq!(height_m, expected_m, epsilon = 1e-6);
         }
     }
 
