@@ -1,9 +1,11 @@
 //! The shaders are valid and in sync with the Rust code; no graphics adapter is needed.
+#![cfg(feature = "gpu")]
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use naga::valid::{Capabilities, ValidationFlags, Validator};
+use wgpu::naga;
+use wgpu::naga::valid::{Capabilities, ValidationFlags, Validator};
 
 fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("src/rendering/gpu")

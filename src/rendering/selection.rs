@@ -73,7 +73,8 @@ impl BackendChoice {
 /// Selects one of the graphics adapters of this machine, or the CPU.
 ///
 /// # Errors
-/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none,
+/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none, [`RenderError::NotBuiltIn`] if this build
+/// could not use one,
 /// [`RenderError::NothingToRasterize`] if the CPU is selected and rasterizing is requested.
 pub fn choose(backend: Backend, method: RenderingMethod) -> Result<BackendChoice, RenderError> {
     let adapters = match backend {
@@ -114,6 +115,7 @@ fn choose_among(
     let adapter = best_adapter(&adapters, backend);
     let reason = match (backend, adapter) {
         (Backend::Cpu, _) => "it was requested".to_owned(),
+        (Backend::Gpu, None) if !cfg!(feature = "gpu") => return Err(RenderError::NotBuiltIn),
         (Backend::Gpu, None) => return Err(RenderError::NoAdapter),
         (Backend::Gpu, Some(_)) => {
             "a graphics adapter was requested, and it is the best".to_owned()
@@ -193,10 +195,12 @@ mod tests {
         let software = adapter("llvmpipe", AdapterKind::Software);
         let choice = choose_among(vec![software], Backend::Gpu, RenderingMethod::Raster).unwrap();
         assert_eq!(choice.adapter, Some(0));
-        assert!(matches!(
-            choose_among(Vec::new(), Backend::Gpu, RenderingMethod::Raster),
-            Err(RenderError::NoAdapter)
-        ));
+        let without = choose_among(Vec::new(), Backend::Gpu, RenderingMethod::Raster).unwrap_err();
+        if cfg!(feature = "gpu") {
+            assert!(matches!(without, RenderError::NoAdapter));
+        } else {
+            assert!(matches!(without, RenderError::NotBuiltIn));
+        }
     }
 
     #[test]

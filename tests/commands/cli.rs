@@ -70,6 +70,16 @@ fn wrong_usage_has_exit_code_2() {
     output.rejects_usage_with(&[r"1\n2"]);
 }
 
+#[cfg(not(feature = "gpu"))]
+#[test]
+fn a_backend_that_is_not_built_in_is_an_error_that_names_the_feature() {
+    let recording = Recording::street(2);
+    recording.fpmcl("build-map").succeeds();
+    let call = fpmcl("localize").in_folder(recording.folder());
+    (call.with("localization.yml").with("--backend=gpu"))
+        .fails_with(&["without the feature gpu", "--features gpu"]);
+}
+
 #[test]
 fn the_doctor_prints_threads_and_backend() {
     let stdout = fpmcl("doctor").with("--measure=0").succeeds().stdout;

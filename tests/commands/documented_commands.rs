@@ -15,10 +15,11 @@ use fpmcl::simulation::SimulationConfig;
 use crate::common::skips::skipped;
 
 /// Options of other programs: cargo, evo and Snakemake.
-const OF_OTHERS: [&str; 8] = [
+const OF_OTHERS: [&str; 9] = [
     "align_origin",
     "cores",
     "directory",
+    "features",
     "forcerun",
     "no-default-features",
     "release",

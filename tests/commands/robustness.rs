@@ -2,7 +2,6 @@
 //! `docs/benchmarks.md`, on a short simulated drive.
 
 use std::fs;
-use std::path::Path;
 use std::sync::LazyLock;
 
 use fpmcl::internals::app::LocalizationResults;
@@ -216,9 +215,7 @@ fn localize_refines_where_it_is_asked_to() {
 /// Where the variable `FPMCL_REQUIRE_GPU` is set, a missing adapter is an error.
 #[test]
 fn the_graphics_card_finds_the_same_path() {
-    let text = run(Path::new("."), &["doctor", "--measure=0"]);
-    let has_adapter =
-        (text.lines()).any(|line| line.starts_with("adapter ") && !line.contains("none"));
+    let has_adapter = common::has_graphics_adapter();
     let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");
     if !has_adapter && !required {
         common::skips::skipped("there is no graphics adapter");

@@ -142,6 +142,12 @@ pub fn run(folder: &Path, arguments: &[&str]) -> String {
     call.succeeds().stdout
 }
 
+/// Whether the program is built for graphics adapters and finds one.
+pub fn has_graphics_adapter() -> bool {
+    let machine = run(Path::new("."), &["doctor", "--measure=0"]);
+    machine.lines().any(|line| line.starts_with("adapter "))
+}
+
 /// Simulates the drives 1 and 2 of a configuration in a folder.
 #[track_caller]
 pub fn simulate_two_drives(folder: &Path, config: &str) {

@@ -32,6 +32,7 @@ fn remedy(error: &(dyn Error + 'static)) -> Option<&'static str> {
         | RenderError::DeviceLost { .. }
         | RenderError::DeviceRefused { .. }
         | RenderError::MapTooLarge { .. } => Some("use --backend cpu"),
+        RenderError::NotBuiltIn => Some("build with --features gpu, or use --backend cpu"),
         RenderError::NothingToRasterize { .. } => {
             Some("set rendering.method to auto or cast, or use --backend gpu")
         }

@@ -74,6 +74,8 @@ pub(super) fn bind(gpu: &Gpu, layout: &BindGroupLayout, buffers: &[&Buffer]) -> 
 
 #[cfg(test)]
 mod tests {
+    use wgpu::naga;
+
     use super::super::layout;
     use super::*;
 
