@@ -10,7 +10,8 @@
 //!
 //! with the n-th share a; the rate is α_slow for a share that is halfway to a loss, so that the slow average, the usual share, begins as
 //! the mean of the shares of right poses. A single share below the usual one by a quarter of the way to a loss may be that of a pose next to
-//! the right one, which is then looked for. One that is halfway there or, of the first ten, all the way is not to be trusted.
+//! the right one, which is then looked for. One that fell halfway there from one frame to the next or, of the first ten, all the way is not
+//! to be trusted, nor are those after it until one is nearer to the usual share.
 //!
 //! A place that was found by a search is confirmed by the share of one scan if nearly all of its beams agree, else by
 //! those of several scans in turn: many places agree with a single scan of few beams. A pose that was uncertain in
@@ -143,6 +144,9 @@ pub struct AgreementMonitor {
     slow: Option<f64>,
     /// Number of shares in the averages.
     observed: usize,
+    last: Option<f64>,
+    /// Whether the last share was doubtful.
+    is_in_doubt: bool,
     /// Updates in turn that agree with a place that was found.
     confirming: usize,
 }
@@ -153,6 +157,8 @@ impl AgreementMonitor {
         let Some(agreement) = agreement else {
             return;
         };
+        self.is_in_doubt = self.is_doubtful(Some(agreement), config);
+        self.last = Some(agreement);
         self.observed += 1;
         let mean_rate = 1.0 / self.observed as f64;
         let slow_rate = if self.is_below_usual(Some(agreement), HALFWAY, config) {
@@ -201,13 +207,19 @@ impl AgreementMonitor {
         self.is_below_usual(agreement, 1.0, config)
     }
 
-    /// Whether a frame with a share is not to be called tracking: the share is nearer to a loss than to the usual one or, as long as
-    /// that is the mean of few shares, far below it.
+    /// Whether a frame with the next share is not to be called tracking: the share is nearer to a loss than to the usual one, and fell
+    /// there from one frame to the next or has been there since. Where a street has changed, shares fall and rise over many frames. As long
+    /// as the usual one is the mean of few shares, one far below it is doubtful.
     pub fn is_doubtful(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
         /// Number of shares whose mean has a third of the standard deviation of a single one.
         const MANY: usize = 10;
-        let way = if self.observed < MANY { 1.0 } else { HALFWAY };
-        self.is_below_usual(agreement, way, config)
+        if self.observed < MANY {
+            return self.is_far_below_usual(agreement, config);
+        }
+        let fall = HALFWAY * (1.0 - config.lost_fraction) * self.slow.unwrap_or(0.0);
+        let both = agreement.zip(self.last);
+        let has_fallen = both.is_some_and(|(share, last)| share < last - fall);
+        self.is_below_usual(agreement, HALFWAY, config) && (has_fallen || self.is_in_doubt)
     }
 
     /// Whether a share is so low that the pose of its frame may be another one around the prediction.
@@ -294,6 +306,28 @@ mod tests {
             assert_eq!(judge(&monitor, None), [false; 3]);
             monitor.observe(Some(usual), &config);
         }
+    }
+
+    #[test]
+    fn a_share_is_doubtful_after_a_sudden_fall_and_not_where_shares_fall_over_many_frames() {
+        let config = TrackingLossConfig::default();
+        let doubtful_in = |shares: &[f64]| {
+            let mut monitor = AgreementMonitor::default();
+            (0..20).for_each(|_| monitor.observe(Some(0.95), &config));
+            let is_doubtful = |&share: &f64| {
+                let is_doubtful = monitor.is_doubtful(Some(share), &config);
+                monitor.observe(Some(share), &config);
+                is_doubtful
+            };
+            shares.iter().map(is_doubtful).collect::<Vec<_>>()
+        };
+        // A hoarding comes into view and passes.
+        let gradual = [0.92, 0.88, 0.84, 0.79, 0.75, 0.73, 0.75, 0.8, 0.86];
+        assert_eq!(doubtful_in(&gradual), [false; 9]);
+        // The motion into a frame was another one than the odometry found.
+        let sudden = [0.94, 0.8, 0.78, 0.76, 0.9, 0.8];
+        let expected = [false, true, true, true, false, false];
+        assert_eq!(doubtful_in(&sudden), expected);
     }
 
     #[test]
