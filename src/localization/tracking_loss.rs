@@ -144,8 +144,9 @@ pub struct AgreementMonitor {
     slow: Option<f64>,
     /// Number of shares in the averages.
     observed: usize,
+    /// Last share.
     last: Option<f64>,
-    /// Whether the last share was doubtful.
+    /// Whether it was doubtful.
     is_in_doubt: bool,
     /// Updates in turn that agree with a place that was found.
     confirming: usize,
@@ -216,10 +217,8 @@ impl AgreementMonitor {
         if self.observed < MANY {
             return self.is_far_below_usual(agreement, config);
         }
-        let fall = HALFWAY * (1.0 - config.lost_fraction) * self.slow.unwrap_or(0.0);
-        let both = agreement.zip(self.last);
-        let has_fallen = both.is_some_and(|(share, last)| share < last - fall);
-        self.is_below_usual(agreement, HALFWAY, config) && (has_fallen || self.is_in_doubt)
+        let has_fallen = || self.is_below(agreement, self.last, HALFWAY, config);
+        self.is_below_usual(agreement, HALFWAY, config) && (self.is_in_doubt || has_fallen())
     }
 
     /// Whether a share is so low that the pose of its frame may be another one around the prediction.
@@ -240,9 +239,21 @@ impl AgreementMonitor {
         way: f64,
         config: &TrackingLossConfig,
     ) -> bool {
-        let fraction = 1.0 - way * (1.0 - config.lost_fraction);
-        let both = agreement.zip(self.slow);
-        both.is_some_and(|(share, slow)| share < fraction * slow)
+        self.is_below(agreement, self.slow, way, config)
+    }
+
+    /// Whether a share is below another one by more than a part of the way from the usual one to a loss.
+    fn is_below(
+        &self,
+        agreement: Option<f64>,
+        other: Option<f64>,
+        way: f64,
+        config: &TrackingLossConfig,
+    ) -> bool {
+        let (Some(share), Some(other), Some(slow)) = (agreement, other, self.slow) else {
+            return false;
+        };
+        share < other - way * (1.0 - config.lost_fraction) * slow
     }
 
     /// Whether a share confirms a pose that was uncertain: it is as large as usual here, or nearly all beams agree and it is

@@ -210,7 +210,7 @@ fn facing(normal: Vec3, direction: Vec3) -> Vec3 {
 pub enum RenderError {
     #[error("backend is gpu, but there is no graphics adapter")]
     NoAdapter,
-    #[error("backend is gpu, but this program was built without the feature gpu")]
+    #[error("backend is gpu, but fpmcl was built without the feature gpu")]
     NotBuiltIn,
     #[error(
         "method is raster, but the map is rendered on the CPU, because {reason}, which only casts rays; set method to auto or cast"

@@ -73,9 +73,8 @@ impl BackendChoice {
 /// Selects one of the graphics adapters of this machine, or the CPU.
 ///
 /// # Errors
-/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none, [`RenderError::NotBuiltIn`] if this build
-/// could not use one,
-/// [`RenderError::NothingToRasterize`] if the CPU is selected and rasterizing is requested.
+/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none, [`RenderError::NotBuiltIn`] without the feature
+/// `gpu`, [`RenderError::NothingToRasterize`] if the CPU is selected and rasterizing is requested.
 pub fn choose(backend: Backend, method: RenderingMethod) -> Result<BackendChoice, RenderError> {
     let adapters = match backend {
         Backend::Cpu => Vec::new(),
@@ -138,7 +137,7 @@ fn choose_among(
 fn reason_for_cpu(adapters: &[AdapterReport]) -> String {
     match adapters.first() {
         None if cfg!(feature = "gpu") => "there is no graphics card".to_owned(),
-        None => "fpmcl was built without the feature `gpu`".to_owned(),
+        None => "fpmcl was built without the feature gpu".to_owned(),
         Some(AdapterReport {
             obstacle: Some(obstacle),
             ..

@@ -66,7 +66,8 @@ impl ParticleFilter {
             }
         }
         let mut estimate = self.updated_estimate(&update, compared)?;
-        let before = self.agreement;
+        // The share of this scan is judged by those before it.
+        let earlier_agreement = self.agreement;
         let mut evidence = self.evidence(&estimate, odometry, update.refutes);
         let is_found = evidence.is_confirmed && !self.phase.is_tracking();
         let found_at = (&update.attitude, Some(estimate.map_from_lidar));
@@ -93,7 +94,8 @@ impl ParticleFilter {
         }
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
-        let is_doubtful = before.is_doubtful(estimate.agreement, &self.config.tracking_loss);
+        let is_doubtful =
+            earlier_agreement.is_doubtful(estimate.agreement, &self.config.tracking_loss);
         let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_doubtful;
         estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
