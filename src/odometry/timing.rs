@@ -5,8 +5,9 @@
 //! for the right one. Near the right times it grows with the square of the error: the residual of compensated scans,
 //! candidates none (0), clockwise (1) and counter-clockwise (−1), is that of 0 by the same amount below both
 //! others, that of clockwise scans by one quarter of the whole range below the next. The scan of a sensor at rest has
-//! the same residual with all candidates. Scans in the order in which their points were measured, which start at
-//! different azimuths, have that order as the only other candidate.
+//! the same residual with all candidates. Where the first start of a direction fits clearly better than no times, no other
+//! start is tried. Scans in the order in which their points were measured, which start at different azimuths, have that order as the
+//! only other candidate.
 
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 
@@ -70,24 +71,25 @@ pub fn compare_timings(
         RotationDirection::Clockwise,
         RotationDirection::CounterClockwise,
     ];
-    let coarse = |direction: &RotationDirection| {
-        let first = first(*direction);
-        Ok((first, runs.best_quarter(first)?))
-    };
-    let coarse: Result<Vec<(Rotation, Fitted)>, TimingError> =
-        directions.par_iter().map(coarse).collect();
+    let firsts = directions.map(first);
+    let first_residuals_m = runs.residuals_of(&firsts)?;
+    let firsts = || firsts.into_iter().zip(first_residuals_m.iter().copied());
+    if firsts().any(|(_, residual_m)| runs.is_clearly_better_than_none(residual_m)) {
+        let rotations = firsts().map(|(it, m)| (Some(PointTiming::Rotation(it)), m));
+        let compared = TimingComparison::decided([none].into_iter().chain(rotations).collect());
+        if compared.best.is_some() {
+            return Ok(compared);
+        }
+    }
+    let coarse: Result<Vec<(Rotation, Fitted)>, TimingError> = (firsts().collect::<Vec<_>>())
+        .par_iter()
+        .map(|&first| Ok((first.0, runs.best_quarter(first)?)))
+        .collect();
     let coarse = coarse?;
-    let is_worse = |residual_m: f64, other_m: f64| residual_m > (1.0 + SPREAD) * other_m;
-    // A first start of one direction with which the scans fit clearly better than without times.
-    let of_first = (coarse.iter())
-        .filter(|(first, found)| found.0 == *first && is_worse(runs.none_m, found.1));
-    let fitting_m = of_first.fold(f64::INFINITY, |least_m, (_, found)| least_m.min(found.1));
     let fitted = |&(first, found): &(Rotation, Fitted)| {
-        // The first start fits: there is nothing to refine. Nor where the best of four is clearly worse than no times, or than
-        // the first start of the other direction: a start that is off by an eighth of a turn has wrong times for an eighth of
-        // the points.
-        let is_done =
-            found.0 == first || is_worse(found.1, runs.none_m) || is_worse(found.1, fitting_m);
+        // The first start fits: there is nothing to refine. Nor where the best of four is clearly worse than no times: a start that is
+        // off by an eighth of a turn has wrong times for an eighth of the points.
+        let is_done = found.0 == first || is_clearly_worse(found.1, runs.none_m);
         let (rotation, residual_m) = if is_done {
             found
         } else {
@@ -100,24 +102,27 @@ pub fn compare_timings(
     Ok(TimingComparison::decided(residuals_m.collect()))
 }
 
-/// The comparison of a timing that is expected with no times and, of a rotation, the opposite direction and the other starts by
-/// quarters of a turn; `None` if it does not fit clearly best, so that the full comparison is needed.
+/// The comparison of a timing that is expected with no times and, where these are not clearly worse, of a rotation with the opposite
+/// direction and the other starts by quarters of a turn; `None` if it does not fit clearly best, so that the full comparison is needed.
 pub fn fits_best(
     timing: PointTiming,
     scans: &[Scan],
     config: &OdometryConfig,
 ) -> Result<Option<TimingComparison>, TimingError> {
-    let timings = match timing {
-        PointTiming::Order { .. } => vec![timing],
-        PointTiming::Rotation(rotation) => {
-            let rotations = quarters(rotation).into_iter().chain([rotation.reversed()]);
-            rotations.map(PointTiming::Rotation).collect()
-        }
-    };
     let runs = Runs::new(scans, config)?;
-    let timed: Result<Vec<_>, TimingError> = timings.par_iter().map(|it| runs.with(*it)).collect();
-    let residuals_m = timed?.into_iter().chain([(None, runs.none_m)]);
-    let compared = TimingComparison::decided(residuals_m.collect());
+    let (expected, none) = (runs.with(timing)?, (None, runs.none_m));
+    let mut residuals_m = vec![expected];
+    if let PointTiming::Rotation(rotation) = timing
+        && !runs.is_clearly_better_than_none(expected.1)
+    {
+        let [_, turned @ ..] = quarters(rotation);
+        let others = turned.into_iter().chain([rotation.reversed()]);
+        let others: Vec<Rotation> = others.collect();
+        let timings = others.iter().map(|&it| Some(PointTiming::Rotation(it)));
+        residuals_m.extend(timings.zip(runs.residuals_of(&others)?));
+    }
+    residuals_m.push(none);
+    let compared = TimingComparison::decided(residuals_m);
     Ok(Some(compared).filter(|compared| compared.best == Some(0)))
 }
 
@@ -163,6 +168,11 @@ fn period_of_order(scans: &[Scan], interval_s: f64) -> Option<f64> {
     let usual_rad = median(sweeps_rad.iter().copied())?;
     let is_even = median(sweeps_rad.iter().map(|rad| (rad - usual_rad).abs()))? < EVEN_RAD;
     Some(interval_s * TAU / if is_even { usual_rad } else { TAU })
+}
+
+/// Whether a residual is larger than another one by as much as decides.
+fn is_clearly_worse(residual_m: f64, other_m: f64) -> bool {
+    residual_m > (1.0 + SPREAD) * other_m
 }
 
 /// Runs of the odometry over the same scans; the first one is without times.
@@ -212,16 +222,22 @@ impl<'a> Runs<'a> {
         Ok((Some(timing), self.run(Some(timing))?.0))
     }
 
-    /// The start of the revolution with the least residual among a first one and those by quarters of a turn from it. Points
-    /// between a wrong start and the right one are off by a whole period.
-    fn best_quarter(&self, first: Rotation) -> Result<Fitted, TimingError> {
+    /// Whether a rotation fits clearly better than no times: then it is the right one, within a twelfth of a turn. Errors of no times are
+    /// uniform within half a sweep, with a mean square of 1/12 of the squared motion; those of the opposite direction are twice as large, and
+    /// with a start that is off by a share s of a turn they are a whole motion for s of the points.
+    fn is_clearly_better_than_none(&self, residual_m: f64) -> bool {
+        is_clearly_worse(self.none_m, residual_m)
+    }
+
+    /// The start of the revolution with the least residual among a first one, whose residual is known, and those by quarters of a turn from
+    /// it. Points between a wrong start and the right one are off by a whole period.
+    fn best_quarter(&self, (first, first_m): Fitted) -> Result<Fitted, TimingError> {
         /// Decrease of the residual by which another start than the first is better (unitless): it takes away errors that are
         /// a quarter of all, √(1 − 0.97²), since they add in squares.
         const BETTER: f64 = 0.03;
-        let turned = quarters(first);
+        let [_, turned @ ..] = quarters(first);
         let residuals_m = self.residuals_of(&turned)?;
-        let first_m = residuals_m[0];
-        let others = turned.into_iter().zip(residuals_m).skip(1);
+        let others = turned.into_iter().zip(residuals_m);
         Ok(others.fold((first, first_m), |best, other| {
             let is_better = other.1 < (1.0 - BETTER) * best.1;
             if is_better { other } else { best }
