@@ -32,6 +32,7 @@ mod config;
 mod equations;
 mod information;
 mod informative;
+mod range_factor;
 #[cfg(test)]
 mod tests;
 
@@ -118,6 +119,23 @@ pub(crate) fn register_informative(
     config: &RegistrationConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
     Linearized::new(renderer, beams, near, config)?.registered()
+}
+
+/// The factor by which the ranges of beams have to be multiplied to fit the map from near a pose; `None` if they do not determine it.
+pub(crate) fn measured_range_factor(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    near: &Pose3,
+    config: &RegistrationConfig,
+) -> Result<Option<f64>, RenderError> {
+    /// Scale of the robust kernel [m]: ranges that are off by a few per cent leave residuals of decimetres.
+    const KERNEL_M: f64 = 0.4;
+    let wide = RegistrationConfig {
+        kernel_m: config.kernel_m.max(KERNEL_M),
+        ..config.clone()
+    };
+    let residuals = linearize(renderer, beams, near, &wide)?;
+    Ok(range_factor::range_factor(&residuals, beams, wide.kernel()))
 }
 
 /// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second

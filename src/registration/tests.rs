@@ -392,3 +392,29 @@ fn ripples_of_the_map_that_no_scan_follows_show_no_position_along_a_corridor() {
         assert!(same < 0.01 && flat > 0.1, "{same} {flat}");
     }
 }
+
+#[test]
+fn the_factor_of_the_ranges_is_found_together_with_the_pose() {
+    let world = TestWorld::street();
+    let truth = world.pose_at(5.0, 0.3, 0.1);
+    let beams = beams(&world, &truth);
+    let config = RegistrationConfig::default();
+    let near = truth * Pose2::new(Vector2::new(0.05, -0.05), 0.002);
+    for (pose, tolerance) in [(truth, 2e-4), (near, 2e-3)] {
+        for factor in [0.98_f64, 0.99, 1.0, 1.01, 1.02] {
+            let distorted: Vec<Beam> = (beams.iter())
+                .map(|beam| Beam {
+                    range_m: beam.range_m / factor as f32,
+                    ..*beam
+                })
+                .collect();
+            let found = measured_range_factor(&world, &distorted, &lift(&world, &pose), &config);
+            // To first order: a tenth of the change.
+            let tolerance = tolerance + 0.1 * (factor - 1.0).abs();
+            assert_relative_eq!(found.unwrap().unwrap(), factor, epsilon = tolerance);
+        }
+    }
+    let few = &beams[..20];
+    let found = measured_range_factor(&world, few, &lift(&world, &truth), &config);
+    assert_eq!(found.unwrap(), None);
+}
