@@ -29,7 +29,7 @@ pub(crate) use grid::Grid2;
 pub(crate) use kd_tree::KdTree;
 pub(crate) use plane::{PlaneFit, PlaneSums};
 pub(crate) use ply_vertex::PlyVertex;
-pub(crate) use pose::{FARTHEST_M, Rigid3f, yaw};
+pub(crate) use pose::{FARTHEST_M, Rigid3f, mirrored_motion, yaw};
 pub(crate) use robust_kernel::RobustKernel;
 pub(crate) use surface_samples::{sample_surface, surface_area_m2};
 pub(crate) use trajectory::distances_m;

@@ -1,7 +1,7 @@
 //! Poses in the plane and in space, and the conversions between them.
 
 use glam::{Mat3, Vec3};
-use nalgebra::{Isometry2, Isometry3, Translation3, UnitQuaternion, Vector6};
+use nalgebra::{Isometry2, Isometry3, Translation3, UnitQuaternion, Vector3, Vector6};
 
 /// A pose or transform in the plane: x, y [m], heading [rad].
 pub type Pose2 = Isometry2<f64>;
@@ -15,6 +15,15 @@ pub const FARTHEST_M: f64 = 4.0e7;
 pub fn yaw(pose: &Pose3) -> f64 {
     let forward = pose.rotation * nalgebra::Vector3::x();
     forward.y.atan2(forward.x)
+}
+
+/// A motion in frames whose y axes point to the other side.
+pub fn mirrored_motion(motion: &Pose3) -> Pose3 {
+    let mut t = motion.translation;
+    t.vector.y = -t.vector.y;
+    let turn = motion.rotation.scaled_axis();
+    let turn = Vector3::new(-turn.x, turn.y, -turn.z);
+    Pose3::from_parts(t, UnitQuaternion::from_scaled_axis(turn))
 }
 
 /// Returns the pose of x, y, z [m], roll, pitch, yaw [deg]: rotations about the fixed axes x, y, z, in this order.

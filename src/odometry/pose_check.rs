@@ -17,7 +17,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use super::config::OdometryConfig;
 use super::odometer::{Odometer, OdometryEstimate, StepState};
 use super::timing::TimingError;
-use crate::geometry::Pose3;
+use crate::geometry::{Pose3, mirrored_motion};
 use crate::lidar::Scan;
 use crate::statistics::median;
 
@@ -76,7 +76,7 @@ impl PoseMeaning {
                 let body = in_frame(world_from_map.inverse(), previous * current.inverse());
                 in_frame(given.body_from_lidar, body)
             }
-            Self::Mirrored => mirrored(&lidar),
+            Self::Mirrored => mirrored_motion(&lidar),
             Self::Turned(rad) => in_frame(Pose3::rotation(Vector3::z() * rad), lidar),
         }
     }
@@ -90,15 +90,6 @@ fn camera_from_lidar() -> Pose3 {
         nalgebra::Translation3::identity(),
         UnitQuaternion::from_scaled_axis(axis * third),
     )
-}
-
-/// A motion in frames whose y axes point to the other side.
-fn mirrored(motion: &Pose3) -> Pose3 {
-    let mut t = motion.translation;
-    t.vector.y = -t.vector.y;
-    let turn = motion.rotation.scaled_axis();
-    let turn = Vector3::new(-turn.x, turn.y, -turn.z);
-    Pose3::from_parts(t, UnitQuaternion::from_scaled_axis(turn))
 }
 
 /// Translation and angle between two motions: medians over the scans.

@@ -59,7 +59,7 @@ fn each_mistake_in_reading_poses_is_found() {
         let inverse: Vec<Pose3> = rows.iter().map(Pose3::inverse).collect();
         assert_eq!(meaning(&inverse, calibration), Some(PoseMeaning::Inverse));
     }
-    let mirrored: Vec<Pose3> = lidar_poses().iter().map(mirrored).collect();
+    let mirrored: Vec<Pose3> = lidar_poses().iter().map(mirrored_motion).collect();
     assert_eq!(meaning(&mirrored, none), Some(PoseMeaning::Mirrored));
     let camera = in_body(calibration());
     assert_eq!(meaning(&camera, none), Some(PoseMeaning::Camera));
