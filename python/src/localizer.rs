@@ -178,6 +178,9 @@ pub struct Estimate {
     /// Effective number of particles after the update, before resampling.
     #[pyo3(get)]
     effective_sample_size: f64,
+    /// What is wrong with the points of all scans, where they fit the map only without it; else None.
+    #[pyo3(get)]
+    distortion: Option<String>,
     /// Whether the scan was used; it is not while the car moved too little.
     #[pyo3(get)]
     updated: bool,
@@ -203,6 +206,7 @@ impl Estimate {
             places: estimate.places,
             mean_cost_m: estimate.mean_cost_m,
             effective_sample_size: estimate.effective_sample_size,
+            distortion: (estimate.distortion).map(|distortion| distortion.to_string()),
             updated: estimate.updated,
             on_mapped_ground: estimate.on_mapped_ground,
             previous_from_current: motion.map(|motion| arrays::of_pose(py, &motion).unbind()),

@@ -24,6 +24,7 @@ fn estimate(state: State, map_from_lidar: Pose3) -> Estimate {
         agreement: Some(0.9),
         places: 1,
         state,
+        distortion: None,
         updated: true,
         on_mapped_ground: true,
         motion: None,

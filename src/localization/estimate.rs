@@ -2,6 +2,7 @@
 
 use nalgebra::Matrix3;
 
+use super::distortion::Distortion;
 use super::particles::ParticleSet;
 use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3};
@@ -33,6 +34,8 @@ pub struct Estimate {
     pub places: usize,
     /// Searching, tracking or lost.
     pub state: State,
+    /// What is wrong with the points of the scans, where they fit the map only without it: no estimate is to be used.
+    pub distortion: Option<Distortion>,
     /// Whether the scan was used; it is not while the car moved too little.
     pub updated: bool,
     /// Whether there is mapped ground under the estimate; otherwise the last known ground is used.

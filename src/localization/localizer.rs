@@ -3,16 +3,17 @@
 use super::config::LocalizerConfig;
 use super::estimate::Estimate;
 use super::filter::ParticleFilter;
-use super::initialization::{StartSpread, around, from_panoramas};
+use super::initialization::{StartDistribution, StartSpread, around, from_panoramas};
 use super::odometry::Odometry;
 use super::particles::{Particle, ParticleSet};
 use super::preparation::ScanPreparation;
 use super::sweep::SweepMotion;
 use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::lidar::{Motion, RangeImage, Scan};
+use crate::lidar::{Beam, Motion, RangeImage, Scan};
 use crate::map::{Map, PanoramaRequest, SearchRegion, SensorAttitude};
 use crate::random::{Generator, stream};
+use crate::registration::measured_range_factor;
 use crate::rendering::RenderError;
 use crate::sensor::{Sensor, SensorError};
 use crate::validation::{InvalidValue, Validate as _, nested};
@@ -96,6 +97,14 @@ pub struct Localizer {
     attitude: SensorAttitude,
     sweep: SweepMotion,
     frames: u64,
+    /// Whether the factor of the ranges is measured in each scan.
+    measures_each_factor: bool,
+    /// Height of the sensor in the panoramas [m]; `None`: that of the scans.
+    panorama_height_m: Option<f64>,
+    /// Number of scans in which a pose was tracked.
+    tracked: usize,
+    /// Factor of the ranges of the last scan, if a pose is tracked and it was measured.
+    range_factor: Option<f64>,
     /// `None` before the first frame.
     filter: Option<ParticleFilter>,
 }
@@ -126,6 +135,10 @@ impl Localizer {
             start,
             seed,
             frames: 0,
+            measures_each_factor: false,
+            panorama_height_m: None,
+            tracked: 0,
+            range_factor: None,
             filter: None,
         })
     }
@@ -183,11 +196,67 @@ impl Localizer {
         filter.set_duration_s(duration_s);
         filter.set_registration_start(start);
         let mut estimate = filter.step(odometry, &image, &self.attitude, &mut rng)?;
+        self.range_factor = None;
+        if estimate.state == State::Tracking {
+            self.tracked += 1;
+            if self.measures_each_factor || self.tracked <= 10 || self.tracked.is_multiple_of(10) {
+                let factor = self.measured_range_factor(&image, &estimate.map_from_lidar);
+                // A tile that cannot be read is an error of the scan that needs it.
+                self.range_factor = factor.ok().flatten();
+            }
+        }
         let pose = Some(estimate.map_from_lidar).filter(|_| estimate.state == State::Tracking);
         let found = pose.and_then(|pose| self.sweep.around(&pose, duration_s));
         self.sweep.update(pose, scan, duration_s);
         estimate.motion = found.or(motion);
         Ok(estimate)
+    }
+
+    /// The factor of the ranges of the last scan with which they fit the map best at the pose that is tracked; `None` where it was not
+    /// measured.
+    pub(super) fn range_factor(&self) -> Option<f64> {
+        self.range_factor
+    }
+
+    /// Whether one pose is followed, also where it is not certain.
+    pub(super) fn follows_a_pose(&self) -> bool {
+        (self.filter.as_ref()).is_some_and(ParticleFilter::follows_a_pose)
+    }
+
+    fn measured_range_factor(
+        &self,
+        image: &RangeImage,
+        map_from_lidar: &Pose3,
+    ) -> Result<Option<f64>, RenderError> {
+        /// Number of beams.
+        const COUNT: usize = 800;
+        // Odd: rows have an even number of columns, most of which would be left out else.
+        let step = image.beams().count().div_ceil(COUNT) | 1;
+        let beams: Vec<Beam> = image.beams().step_by(step).collect();
+        let config = &self.config.proposal.registration;
+        measured_range_factor(&*self.map.renderer, &beams, map_from_lidar, config)
+    }
+
+    /// A localizer of the same drive for scans without a distortion, near a pose, or else with an unknown start.
+    pub(super) fn begin_undistorted(&self, pose: Option<Pose3>) -> Option<Self> {
+        /// Spread around a pose to which ranges have led that are off by a few per cent.
+        const SPREAD: StartSpread = StartSpread {
+            distribution: StartDistribution::Gaussian,
+            position_m: 0.5,
+            heading_rad: 0.05,
+        };
+        let start = match (pose, &self.start) {
+            (Some(pose), _) => Start::near(&pose, SPREAD),
+            (None, Start::Anywhere) => Start::Anywhere,
+            (None, Start::Pose { .. } | Start::Road) => Start::Road,
+        };
+        let (sensor, config) = (&self.preparation.sensor, self.config.clone());
+        let localizer = Self::new(&self.map, sensor, config, start, self.seed).ok()?;
+        Some(Self {
+            measures_each_factor: true,
+            panorama_height_m: Some(self.panorama_request().sensor_height_m),
+            ..localizer
+        })
     }
 
     /// Pose of a scan whose points have times, by a registration of some of them with the predicted motion during the sweep;
@@ -267,7 +336,9 @@ impl Localizer {
         PanoramaRequest {
             region,
             lidar: self.preparation.sensor.range_image.clone(),
-            sensor_height_m: (self.preparation.sensor.sensor_height_m).unwrap_or(rounded_m),
+            sensor_height_m: (self.panorama_height_m)
+                .or(self.preparation.sensor.sensor_height_m)
+                .unwrap_or(rounded_m),
             config: self.config.panorama.clone(),
         }
     }

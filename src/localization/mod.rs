@@ -4,7 +4,7 @@
 //! > range images with the attitude of the sensor and feeds the particle `filter`: `initialization` samples the first
 //! > particles, `motion` moves them by the `odometry`, `observation` weights them, `resampling` keeps the likely ones,
 //! > `places` compares those that are far apart, `convergence` decides when few are enough and `tracking_loss` when
-//! > none is right.
+//! > none is right, and `distortion_search` what is wrong with all scans.
 //!
 //! Particles are planar poses `map_from_lidar`; the ground of the map gives height, roll and pitch.
 //!
@@ -29,6 +29,8 @@ pub(crate) mod resampling;
 pub(crate) mod tempering;
 // Confidence.
 pub(crate) mod convergence;
+mod distortion;
+mod distortion_search;
 pub(crate) mod tracking_loss;
 // The loop.
 pub(crate) mod filter;
@@ -39,6 +41,7 @@ pub(crate) mod tracker;
 
 pub use config::LocalizerConfig;
 pub use convergence::ConvergenceConfig;
+pub use distortion::Distortion;
 pub use error::TrackerError;
 pub use estimate::Estimate;
 pub use front_end::{FrontEnd, Measured};

@@ -11,11 +11,13 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::config::LocalizerConfig;
+use super::distortion_search::{DistortionSearch, GivenScan};
 use super::error::TrackerError;
 use super::estimate::Estimate;
 use super::front_end::{FrontEnd, Measured};
 use super::localizer::{Localizer, Start};
 use super::odometry::Odometry;
+use super::tracking_loss::State;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
 use crate::map::Map;
@@ -75,6 +77,7 @@ impl Tracker {
                 start: Start::unknown(map),
                 since_localized: Pose3::identity(),
                 localizer: None,
+                distortions: DistortionSearch::default(),
             },
             measured: None,
         })
@@ -192,6 +195,7 @@ pub struct BackEnd {
     since_localized: Pose3,
     /// `None` before the first scan.
     localizer: Option<Localizer>,
+    distortions: DistortionSearch,
 }
 
 impl BackEnd {
@@ -219,12 +223,30 @@ impl BackEnd {
         };
         localizer.set_own_car(measured.sensor.own_car_m);
         let scan = measured.timed.as_ref().unwrap_or(scan);
-        let estimate = self.localizer.insert(localizer).step(scan, odometry);
-        match estimate {
-            Ok(_) => self.since_localized = Pose3::identity(),
-            Err(_) => self.leave_out(measured),
+        let localizer = self.localizer.insert(localizer);
+        let mut estimate = match localizer.step(scan, odometry) {
+            Ok(estimate) => estimate,
+            Err(error) => {
+                self.leave_out(measured);
+                return Err(error.into());
+            }
+        };
+        self.since_localized = Pose3::identity();
+        let given = GivenScan {
+            scan,
+            odometry,
+            own_car_m: measured.sensor.own_car_m,
+            estimate: &estimate,
+            is_followed: localizer.follows_a_pose(),
+            range_factor: localizer.range_factor(),
+        };
+        let config = &self.config.tracking_loss;
+        let begin = |pose| localizer.begin_undistorted(pose);
+        if let Some(distortion) = self.distortions.judge(given, config, begin) {
+            estimate.state = State::Lost;
+            estimate.distortion = Some(distortion);
         }
-        Ok(estimate?)
+        Ok(estimate)
     }
 
     /// Remembers the motion into a scan that is not localized.
@@ -236,6 +258,7 @@ impl BackEnd {
         self.start = start;
         self.since_localized = Pose3::identity();
         self.localizer = None;
+        self.distortions = DistortionSearch::default();
     }
 
     /// The localizer before the first scan.

@@ -1,8 +1,10 @@
 //! The tracker on scans of a street.
 
+use glam::Vec3;
+
 use super::*;
 use crate::geometry::Pose2;
-use crate::localization::{StartSpread, State};
+use crate::localization::{Distortion, StartSpread, State};
 use crate::map::world_for_tests::TestWorld;
 use crate::odometry::Odometer;
 use crate::sensor::{SensorError, TIMING_SCANS};
@@ -196,4 +198,37 @@ fn a_restarted_tracker_is_a_new_one_with_its_sensor_and_preparing_the_start_chan
         restarted.restart(start).unwrap();
         assert_eq!(states(&mut restarted), expected);
     }
+}
+
+#[test]
+fn scans_of_a_left_handed_frame_or_with_ranges_by_a_wrong_factor_are_lost_and_named() {
+    const FACTOR: f32 = 1.05;
+    let world = TestWorld::street();
+    let drive = drive_of(20, &world);
+    let tracked = |changed: &dyn Fn(Vec3) -> Vec3| {
+        let tracker = Tracker::new(&world.map(), config()).unwrap();
+        let mut tracker = tracker.with_start(Start::Road);
+        let step = |(_, scan): &(Pose2, Scan)| {
+            let points = scan.points.iter().map(|&point| changed(point)).collect();
+            let scan = Scan {
+                points,
+                ..scan.clone()
+            };
+            tracker.step(&scan).unwrap()
+        };
+        drive.iter().map(step).collect::<Vec<Estimate>>()
+    };
+    let is_tracked = |found: &[Estimate]| found.iter().any(|it| it.state == State::Tracking);
+    let mirrored = tracked(&|point| Vec3::new(point.x, -point.y, point.z));
+    assert_eq!(mirrored[19].distortion, Some(Distortion::Mirrored));
+    assert!(!is_tracked(&mirrored));
+    let scaled = tracked(&|point| FACTOR * point);
+    let Some(Distortion::Scaled { factor }) = scaled[19].distortion else {
+        panic!("{:?}", scaled[19].distortion);
+    };
+    assert!((factor - f64::from(FACTOR)).abs() < 3e-3, "{factor}");
+    assert!(!is_tracked(&scaled));
+    let right = tracked(&|point| point);
+    assert!(right.iter().all(|it| it.distortion.is_none()));
+    assert!(right[5..].iter().all(|it| it.state == State::Tracking));
 }

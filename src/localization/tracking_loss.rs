@@ -194,6 +194,11 @@ impl AgreementMonitor {
         self.confirming >= config.confirming_updates
     }
 
+    /// The usual share; `None` before the first one.
+    pub fn usual(&self) -> Option<f64> {
+        self.slow
+    }
+
     /// Whether tracking is lost.
     pub fn is_lost(&self, config: &TrackingLossConfig) -> bool {
         let (Some(fast), Some(slow)) = (self.fast, self.slow) else {

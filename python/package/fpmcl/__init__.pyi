@@ -267,6 +267,10 @@ class Estimate:
         """Effective number of particles after the update, before resampling."""
 
     @property
+    def distortion(self) -> Optional[str]:
+        """What is wrong with the points of all scans, where they fit the map only without it; else None."""
+
+    @property
     def updated(self) -> bool:
         """Whether the scan was used; it is not while the car moved too little."""
 

@@ -139,6 +139,11 @@ impl ParticleFilter {
         self
     }
 
+    /// Whether one pose is followed, also where it is not certain.
+    pub fn follows_a_pose(&self) -> bool {
+        self.phase.is_tracking()
+    }
+
     /// Sets the time between the previous frame and the next [s].
     pub fn set_duration_s(&mut self, duration_s: f64) {
         self.duration_s = duration_s;
@@ -190,6 +195,7 @@ impl ParticleFilter {
             agreement: None,
             places: self.likely_places(),
             state: self.phase.reported(self.is_precise(&covariance)),
+            distortion: None,
             updated: false,
             on_mapped_ground: found.is_some(),
             motion: None,

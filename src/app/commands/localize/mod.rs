@@ -120,6 +120,7 @@ pub fn run_with(
     let is_unfilled = context.interrupt.supervise(
         || {
             localize(&opened, motion, &recorded)?;
+            recorded().refuse_distorted();
             let searched = recorded().searched();
             let is_unfilled = searched.is_some() && context.interrupt.requested();
             let filled = searched

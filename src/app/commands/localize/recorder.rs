@@ -18,7 +18,7 @@ use crate::app::report::run_output::{self, Movie};
 use crate::app::run::{Claims, Interrupted};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
-use crate::localization::State;
+use crate::localization::{Distortion, State};
 use crate::recording::{Frame, ScanSource};
 
 /// A column of the results, where it is kept.
@@ -40,6 +40,8 @@ pub struct Run {
     pub movie: Option<Movie>,
     /// Number of frames without mapped ground below the estimate.
     off_ground: usize,
+    /// What is wrong with all scans, and the number of frames in which it was certain.
+    distorted: Option<(Distortion, usize)>,
     /// Number of frames that were left out: of a recording that is replayed, those that nobody waited for.
     pub missed: usize,
     /// What a run at the pace of the recording showed.
@@ -96,6 +98,7 @@ impl Run {
                 None
             },
             off_ground: 0,
+            distorted: None,
             missed: 0,
             live: None,
             failure: None,
@@ -137,6 +140,10 @@ impl Run {
         let particles = run_output::particle_rows(&estimate.particles);
         results.particles.push_frame(&particles)?;
         self.off_ground += usize::from(!estimate.on_mapped_ground);
+        if let Some(distortion) = estimate.distortion {
+            let frames = self.distorted.map_or(0, |(_, frames)| frames);
+            self.distorted = Some((distortion, frames + 1));
+        }
         push(&mut results.estimates, estimate.pose);
         let truth = frame.map_from_lidar.unwrap_or_else(unknown_pose);
         push(&mut results.ground_truth, pose2_from_pose3(&truth));
@@ -279,6 +286,33 @@ impl Run {
             );
         }
         Ok(())
+    }
+
+    /// Warns of what is wrong with the scans, where it is certain in more frames than those in which a pose was tracked; then no pose is to be
+    /// trusted.
+    pub fn refuse_distorted(&mut self) {
+        let states = self.results.states.iter().flatten();
+        let tracking = states.filter(|&&state| state == State::Tracking as u8);
+        let tracking = tracking.count();
+        let Some((distortion, frames)) = self.distorted.filter(|(_, it)| *it > tracking) else {
+            return;
+        };
+        let remedy = match distortion {
+            Distortion::Mirrored => "their frame is left-handed; y must point to the left of x",
+            Distortion::Scaled { .. } => "check the unit and the factor of the ranges",
+        };
+        tracing::warn!(
+            "{frames} scans fit the map only with {distortion}: {remedy}; no pose is trusted"
+        );
+        let results = &mut self.results;
+        let of_both = [&mut results.states, &mut results.refined_states];
+        for state in of_both
+            .into_iter()
+            .flatten()
+            .flat_map(|states| states.iter_mut())
+        {
+            *state = State::Lost as u8;
+        }
     }
 }
 
