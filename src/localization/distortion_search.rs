@@ -38,6 +38,8 @@ pub(super) struct GivenScan<'a> {
     /// Rectangle of the own car: x_min, x_max, y_min, y_max [m].
     pub own_car_m: [f32; 4],
     pub estimate: &'a Estimate,
+    /// Whether the search is one of the whole map from the first scan on, for which its panoramas were made.
+    pub is_start_unknown: bool,
     /// Whether one pose is followed, also where it is not certain.
     pub is_followed: bool,
     /// The factor by which its ranges fit the map best at the pose that it tracks, where that was measured.
@@ -125,7 +127,7 @@ impl DistortionSearch {
             let pose = given.estimate.map_from_lidar;
             return (*by_factor <= MOST).then_some((Distortion::Scaled { factor }, Some(pose)));
         }
-        let is_lost = given.estimate.state == State::Lost;
+        let is_lost = given.is_start_unknown && given.estimate.state == State::Lost;
         let is_unknown = is_lost || self.unknown > config.confirming_updates;
         let all = Distortion::all();
         let is_due = *tried < ROUNDS * all.clone().count() || self.unknown.is_multiple_of(PAUSE);

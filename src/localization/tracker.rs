@@ -237,6 +237,7 @@ impl BackEnd {
             odometry,
             own_car_m: measured.sensor.own_car_m,
             estimate: &estimate,
+            is_start_unknown: !matches!(self.start, Start::Pose { .. }),
             is_followed: localizer.follows_a_pose(),
             range_factor: localizer.range_factor(),
         };
