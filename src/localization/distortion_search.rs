@@ -117,6 +117,9 @@ impl DistortionSearch {
         const MOST: usize = 10;
         /// Scans between two that are suspected after all rounds.
         const PAUSE: usize = 10;
+        if !given.is_start_unknown {
+            return None;
+        }
         if self.certain.is_some() {
             return Some((self.certain?, None));
         }
@@ -127,7 +130,7 @@ impl DistortionSearch {
             let pose = given.estimate.map_from_lidar;
             return (*by_factor <= MOST).then_some((Distortion::Scaled { factor }, Some(pose)));
         }
-        let is_lost = given.is_start_unknown && given.estimate.state == State::Lost;
+        let is_lost = given.estimate.state == State::Lost;
         let is_unknown = is_lost || self.unknown > config.confirming_updates;
         let all = Distortion::all();
         let is_due = *tried < ROUNDS * all.clone().count() || self.unknown.is_multiple_of(PAUSE);
