@@ -10,6 +10,7 @@ use crate::lidar::Scan;
 const STEP: f64 = 1.03;
 /// Number of factors above one, and below it: up to 23 % too long and 19 % too short.
 const STEPS: i32 = 7;
+
 /// What is wrong with the points of all scans.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Distortion {
@@ -25,8 +26,10 @@ pub enum Distortion {
 impl fmt::Display for Distortion {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Mirrored => formatter.write_str("y of the other sign"),
-            Self::Scaled { factor } => write!(formatter, "ranges divided by {factor:.3}"),
+            Self::Mirrored => formatter.write_str("y of the wrong sign"),
+            Self::Scaled { factor } => {
+                write!(formatter, "ranges of {factor:.3} times the true ones")
+            }
         }
     }
 }

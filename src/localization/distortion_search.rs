@@ -1,5 +1,5 @@
-//! Scans that no drive through the map gives: with y of the other sign, as left-handed drivers write them, or with ranges by a wrong
-//! factor.
+//! Search for a [`Distortion`] of the scans of a drive, with an unknown start: y of the wrong sign, as left-handed drivers write it, or
+//! ranges that are too long or too short.
 //!
 //! ```text
 //! suspect   while no pose is tracked, another localizer takes the scans with one distortion after another undone; while one is, with
@@ -38,21 +38,22 @@ pub(super) struct GivenScan<'a> {
     /// Rectangle of the own car: x_min, x_max, y_min, y_max [m].
     pub own_car_m: [f32; 4],
     pub estimate: &'a Estimate,
-    /// Whether the search is one of the whole map from the first scan on, for which its panoramas were made.
-    pub is_start_unknown: bool,
     /// Whether one pose is followed, also where it is not certain.
     pub is_followed: bool,
     /// The factor by which its ranges fit the map best at the pose that it tracks, where that was measured.
     pub range_factor: Option<f64>,
 }
 
-/// Looks for a distortion of the scans of a drive.
+/// Search for a distortion of the scans of a drive. Its localizers search the whole map, whose panoramas a search near a known start may do
+/// without.
 #[derive(Default)]
 pub(super) struct DistortionSearch {
     /// Number of scans since a pose was followed.
-    unknown: usize,
-    /// Number of distortions that were suspected while no pose was, and of those by the factor of the ranges.
-    tried: [usize; 2],
+    without_pose: usize,
+    /// Number of distortions that were suspected while none was.
+    suspected: usize,
+    /// Number of distortions that were suspected by the factor of the ranges.
+    suspected_by_factor: usize,
     /// A distortion of which scans were tracked, until they are not again.
     certain: Option<Distortion>,
     suspect: Option<Suspect>,
@@ -83,10 +84,10 @@ impl DistortionSearch {
         begin: impl Fn(Option<Pose3>) -> Option<Localizer>,
     ) -> Option<Distortion> {
         let is_tracking = given.estimate.state == State::Tracking;
-        self.unknown = if given.is_followed {
+        self.without_pose = if given.is_followed {
             0
         } else {
-            self.unknown + 1
+            self.without_pose + 1
         };
         if self.suspect.is_none() {
             let (distortion, pose) = self.next_distortion(&given, config)?;
@@ -117,28 +118,28 @@ impl DistortionSearch {
         const MOST: usize = 10;
         /// Scans between two that are suspected after all rounds.
         const PAUSE: usize = 10;
-        if !given.is_start_unknown {
-            return None;
+        if let Some(certain) = self.certain {
+            return Some((certain, None));
         }
-        if self.certain.is_some() {
-            return Some((self.certain?, None));
-        }
-        let [tried, by_factor] = &mut self.tried;
         if let Some(ratio) = given.range_factor.filter(|&ratio| differs_from_one(ratio)) {
-            *by_factor += 1;
-            let factor = 1.0 / ratio;
+            self.suspected_by_factor += 1;
+            let distortion = Distortion::Scaled {
+                factor: 1.0 / ratio,
+            };
             let pose = given.estimate.map_from_lidar;
-            return (*by_factor <= MOST).then_some((Distortion::Scaled { factor }, Some(pose)));
+            return (self.suspected_by_factor <= MOST).then_some((distortion, Some(pose)));
         }
         let is_lost = given.estimate.state == State::Lost;
-        let is_unknown = is_lost || self.unknown > config.confirming_updates;
+        let is_unknown = is_lost || self.without_pose > config.confirming_updates;
         let all = Distortion::all();
-        let is_due = *tried < ROUNDS * all.clone().count() || self.unknown.is_multiple_of(PAUSE);
+        let in_rounds = self.suspected < ROUNDS * all.clone().count();
+        let is_due = in_rounds || self.without_pose.is_multiple_of(PAUSE);
         if given.is_followed || !is_unknown || !is_due {
             return None;
         }
-        *tried += 1;
-        Some((all.cycle().nth(*tried - 1)?, None))
+        let next = all.cycle().nth(self.suspected);
+        self.suspected += 1;
+        next.map(|distortion| (distortion, None))
     }
 }
 

@@ -199,7 +199,7 @@ impl Localizer {
         self.range_factor = None;
         if estimate.state == State::Tracking {
             self.tracked += 1;
-            if self.measures_each_factor || self.tracked <= 10 || self.tracked.is_multiple_of(10) {
+            if self.measures_each_factor || self.is_range_factor_due() {
                 let factor = self.measured_range_factor(&image, &estimate.map_from_lidar);
                 // A tile that cannot be read is an error of the scan that needs it.
                 self.range_factor = factor.ok().flatten();
@@ -216,6 +216,14 @@ impl Localizer {
     /// measured.
     pub(super) fn range_factor(&self) -> Option<f64> {
         self.range_factor
+    }
+
+    /// Whether the factor is measured in the scan of a drive that may be distorted: in the first tracked ones, and then now and then.
+    fn is_range_factor_due(&self) -> bool {
+        const FIRST: usize = 10;
+        const STEP: usize = 10;
+        let is_start_known = matches!(self.start, Start::Pose { .. });
+        !is_start_known && (self.tracked <= FIRST || self.tracked.is_multiple_of(STEP))
     }
 
     /// Whether one pose is followed, also where it is not certain.
@@ -237,7 +245,7 @@ impl Localizer {
         measured_range_factor(&*self.map.renderer, &beams, map_from_lidar, config)
     }
 
-    /// A localizer of the same drive for scans without a distortion, near a pose, or else with an unknown start.
+    /// A localizer of the same drive for scans without a distortion, near a pose, or else with the same start.
     pub(super) fn begin_undistorted(&self, pose: Option<Pose3>) -> Option<Self> {
         /// Spread around a pose to which ranges have led that are off by a few per cent.
         const SPREAD: StartSpread = StartSpread {
@@ -245,10 +253,9 @@ impl Localizer {
             position_m: 0.5,
             heading_rad: 0.05,
         };
-        let start = match (pose, &self.start) {
-            (Some(pose), _) => Start::near(&pose, SPREAD),
-            (None, Start::Anywhere) => Start::Anywhere,
-            (None, Start::Pose { .. } | Start::Road) => Start::Road,
+        let start = match pose {
+            Some(pose) => Start::near(&pose, SPREAD),
+            None => self.start.clone(),
         };
         let (sensor, config) = (&self.preparation.sensor, self.config.clone());
         let localizer = Self::new(&self.map, sensor, config, start, self.seed).ok()?;

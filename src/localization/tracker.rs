@@ -195,6 +195,7 @@ pub struct BackEnd {
     since_localized: Pose3,
     /// `None` before the first scan.
     localizer: Option<Localizer>,
+    /// Not used where the start is known.
     distortions: DistortionSearch,
 }
 
@@ -232,12 +233,14 @@ impl BackEnd {
             }
         };
         self.since_localized = Pose3::identity();
+        if matches!(self.start, Start::Pose { .. }) {
+            return Ok(estimate);
+        }
         let given = GivenScan {
             scan,
             odometry,
             own_car_m: measured.sensor.own_car_m,
             estimate: &estimate,
-            is_start_unknown: !matches!(self.start, Start::Pose { .. }),
             is_followed: localizer.follows_a_pose(),
             range_factor: localizer.range_factor(),
         };

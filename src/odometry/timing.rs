@@ -71,18 +71,17 @@ pub fn compare_timings(
         RotationDirection::Clockwise,
         RotationDirection::CounterClockwise,
     ];
-    let firsts = directions.map(first);
-    let first_residuals_m = runs.residuals_of(&firsts)?;
-    let firsts = || firsts.into_iter().zip(first_residuals_m.iter().copied());
-    if firsts().any(|(_, residual_m)| runs.is_clearly_better_than_none(residual_m)) {
-        let rotations = firsts().map(|(it, m)| (Some(PointTiming::Rotation(it)), m));
+    let starts = directions.map(first);
+    let residuals_m = runs.residuals_of(&starts)?;
+    let firsts: Vec<Fitted> = starts.into_iter().zip(residuals_m).collect();
+    if (firsts.iter()).any(|&(_, residual_m)| runs.is_clearly_better_than_none(residual_m)) {
+        let rotations = (firsts.iter()).map(|&(it, m)| (Some(PointTiming::Rotation(it)), m));
         let compared = TimingComparison::decided([none].into_iter().chain(rotations).collect());
         if compared.best.is_some() {
             return Ok(compared);
         }
     }
-    let coarse: Result<Vec<(Rotation, Fitted)>, TimingError> = (firsts().collect::<Vec<_>>())
-        .par_iter()
+    let coarse: Result<Vec<(Rotation, Fitted)>, TimingError> = (firsts.par_iter())
         .map(|&first| Ok((first.0, runs.best_quarter(first)?)))
         .collect();
     let coarse = coarse?;

@@ -65,6 +65,14 @@ impl RegistrationConfig {
         }
     }
 
+    /// The settings with a kernel of at least that scale [m], for returns that are farther off.
+    pub(crate) fn with_kernel(&self, kernel_m: f64) -> Self {
+        Self {
+            kernel_m: self.kernel_m.max(kernel_m),
+            ..self.clone()
+        }
+    }
+
     /// The settings for a pose that is not certain, with twice the noise of the normals: where they are noisier than usual,
     /// as on parts of a tunnel or of a motorway, they would confirm a wrong place.
     pub(crate) fn cautious(&self) -> Self {

@@ -130,10 +130,7 @@ pub(crate) fn measured_range_factor(
 ) -> Result<Option<f64>, RenderError> {
     /// Scale of the robust kernel [m]: ranges that are off by a few per cent leave residuals of decimetres.
     const KERNEL_M: f64 = 0.4;
-    let wide = RegistrationConfig {
-        kernel_m: config.kernel_m.max(KERNEL_M),
-        ..config.clone()
-    };
+    let wide = config.with_kernel(KERNEL_M);
     let residuals = linearize(renderer, beams, near, &wide)?;
     Ok(range_factor::range_factor(&residuals, beams, wide.kernel()))
 }
@@ -149,10 +146,9 @@ pub(crate) fn register_coarse_to_fine(
     config: &RegistrationConfig,
     is_accepted: impl Fn(&Pose3) -> bool,
 ) -> Result<Option<RegistrationResult>, RenderError> {
-    let wide = RegistrationConfig {
-        kernel_m: config.kernel_m.max(wide_kernel_m),
-        ..config.with_tolerance(COARSE_TOLERANCE_M)
-    };
+    let wide = config
+        .with_tolerance(COARSE_TOLERANCE_M)
+        .with_kernel(wide_kernel_m);
     let (mut pose, mut accepted) = (*initial, None);
     for (beams, config) in beams.into_iter().zip([&wide, config]) {
         let Some(found) = Linearized::new(renderer, beams, &pose, config)?.descend()? else {

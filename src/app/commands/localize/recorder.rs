@@ -288,8 +288,7 @@ impl Run {
         Ok(())
     }
 
-    /// Warns of what is wrong with the scans, where it is certain in more frames than those in which a pose was tracked; then no pose is to be
-    /// trusted.
+    /// Calls all frames lost, with a warning, if their scans are distorted in more of them than a pose was tracked in.
     pub fn refuse_distorted(&mut self) {
         let states = self.results.states.iter().flatten();
         let tracking = states.filter(|&&state| state == State::Tracking as u8);
@@ -302,7 +301,7 @@ impl Run {
             Distortion::Scaled { .. } => "check the unit and the factor of the ranges",
         };
         tracing::warn!(
-            "{frames} scans fit the map only with {distortion}: {remedy}; no pose is trusted"
+            "by the map, {frames} scans have {distortion}: {remedy}; no pose is trusted"
         );
         let results = &mut self.results;
         let of_both = [&mut results.states, &mut results.refined_states];
