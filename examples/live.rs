@@ -9,9 +9,8 @@ use std::path::PathBuf;
 use std::thread;
 use std::time::Duration;
 
-use fpmcl::geometry::Pose3;
 use fpmcl::live::{Inbox, Latencies, Monitor, Received};
-use fpmcl::localization::{Odometry, Tracker, TrackerConfig};
+use fpmcl::localization::{Tracker, TrackerConfig};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::Recording;
 
@@ -38,11 +37,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             // Of the scans; a node with wheels passes theirs.
             let odometry = tracker.measure(&arrival.scan)?;
             let estimate = tracker.step_with_motion(&arrival.scan, odometry)?;
-            let motion = match odometry {
-                Odometry::Motion(motion) => motion,
-                _ => Pose3::identity(),
-            };
-            monitor.update(&estimate, &motion);
+            monitor.update(&estimate, &odometry.in_space().unwrap_or_default());
             latencies.add(arrival.arrived.elapsed());
             let (state, reason) = (monitor.state().word(), monitor.reason().words());
             let map_from_odom = monitor.map_from_odom().map(|it| it.translation);

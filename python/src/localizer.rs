@@ -101,9 +101,8 @@ impl Localizer {
             None => self.tracker.measure(scan)?,
         };
         let motion = match odometry {
-            Odometry::Motion(motion) => Some(motion),
             Odometry::Increment(increment) => Some(arrays::in_space(&increment)),
-            _ => None,
+            _ => odometry.in_space(),
         };
         Ok((self.tracker.step_with_motion(scan, odometry)?, motion))
     }

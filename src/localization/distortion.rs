@@ -58,11 +58,8 @@ impl Distortion {
 
     /// A motion in space without the distortion, which is taken to be that of the scans; that of wheels and of commands is not distorted.
     pub(super) fn undistort_motion(self, odometry: Odometry) -> Odometry {
-        let Odometry::Motion(motion) = odometry else {
-            return odometry;
-        };
-        Odometry::Motion(match self {
-            Self::Mirrored => mirrored_motion(&motion),
+        odometry.map_in_space(|motion| match self {
+            Self::Mirrored => mirrored_motion(motion),
             Self::Scaled { factor } => {
                 let translation = motion.translation.vector / factor;
                 Pose3::from_parts(translation.into(), motion.rotation)
@@ -98,10 +95,8 @@ mod tests {
         };
         for distortion in Distortion::all() {
             let undone = |point: Point3<f64>| of(distortion.undistort(&scan_of(point)).points[0]);
-            let Odometry::Motion(moved) = distortion.undistort_motion(Odometry::Motion(motion))
-            else {
-                panic!("{distortion}");
-            };
+            let odometry = distortion.undistort_motion(Odometry::Motion(motion));
+            let moved = odometry.in_space().unwrap();
             let (before, after) = (undone(motion * of(current)), moved * undone(of(current)));
             assert_relative_eq!(before, after, epsilon = 1e-5);
             let corner = undone(Point3::new(-4.0, 2.0, 0.0));

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
 use super::error::TrackerError;
-use crate::geometry::Pose3;
+use super::odometry::MotionOfScans;
 use crate::lidar::Scan;
 use crate::odometry::{Odometer, OdometryConfig};
 use crate::sensor::{Sensor, SensorConfig, SensorError, TIMING_SCANS};
@@ -27,7 +27,7 @@ pub struct FrontEnd {
     /// `None` where it is not wanted, and since it missed a scan.
     odometer: Option<Odometer>,
     /// Motion over the scans since the last one that was measured.
-    since_measured: Pose3,
+    since_measured: MotionOfScans,
 }
 
 /// A sensor and whether scans showed all of it.
@@ -40,7 +40,7 @@ pub struct Measured {
     /// The scan with the times of its points, where it lacked them.
     pub(super) timed: Option<Scan>,
     /// Motion since the last scan that was measured; `None` without odometry.
-    pub(super) previous_from_current: Option<Pose3>,
+    pub(super) motion: Option<MotionOfScans>,
 }
 
 impl FrontEnd {
@@ -56,7 +56,7 @@ impl FrontEnd {
             sensor,
             odometer: odometry.clone().map(Odometer::new).transpose()?,
             odometry,
-            since_measured: Pose3::identity(),
+            since_measured: MotionOfScans::default(),
             known,
         })
     }
@@ -73,7 +73,7 @@ impl FrontEnd {
     /// Forgets all scans but what they showed about the sensor.
     pub(super) fn restart(&mut self) -> Result<(), InvalidValue> {
         self.odometer = self.odometry.clone().map(Odometer::new).transpose()?;
-        self.since_measured = Pose3::identity();
+        self.since_measured = MotionOfScans::default();
         Ok(())
     }
 
@@ -109,7 +109,7 @@ impl FrontEnd {
         Ok(Measured {
             sensor,
             timed,
-            previous_from_current: self.odometer.is_some().then_some(motion),
+            motion: self.odometer.is_some().then_some(motion),
         })
     }
 
@@ -124,7 +124,8 @@ impl FrontEnd {
         let sensor = self.learn(scan)?;
         let timed = sensor.timed(scan);
         if let Some(odometer) = &mut self.odometer {
-            self.since_measured *= odometer.step(&timed)?.previous_from_current;
+            let of_scan = (&odometer.step(&timed)?).into();
+            self.since_measured = self.since_measured.followed_by(of_scan);
         }
         let timed = match timed {
             Cow::Borrowed(_) => None,

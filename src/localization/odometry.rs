@@ -10,6 +10,7 @@ use rand::Rng;
 
 use super::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
 use crate::geometry::{FARTHEST_M, Pose2, Pose3, pose2_from_pose3};
+use crate::odometry::{OdometryEstimate, StepState};
 
 /// Known motion into a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -18,6 +19,8 @@ pub enum Odometry {
     Increment(Pose2),
     /// Measured in space, such as by the odometry of the scans; roll and pitch follow it too.
     Motion(Pose3),
+    /// The same, but assumed in some direction: a motion that the scans do not determine, or only after a surprise.
+    Assumed(Pose3),
     /// Commanded: velocities held since the previous frame.
     Velocity(VelocityCommand),
     /// Unknown: the motion into the previous frame is assumed to continue (constant velocity).
@@ -29,9 +32,26 @@ impl Odometry {
     pub(super) fn in_plane(&self) -> Option<Pose2> {
         match self {
             Self::Increment(increment) => Some(*increment),
-            Self::Motion(motion) => Some(pose2_from_pose3(motion)),
+            Self::Motion(motion) | Self::Assumed(motion) => Some(pose2_from_pose3(motion)),
             Self::Velocity(command) => Some(command.compose()),
             Self::Unknown => None,
+        }
+    }
+
+    /// The motion in space; `None` if it was not measured there.
+    pub fn in_space(&self) -> Option<Pose3> {
+        match self {
+            Self::Motion(motion) | Self::Assumed(motion) => Some(*motion),
+            Self::Increment(_) | Self::Velocity(_) | Self::Unknown => None,
+        }
+    }
+
+    /// The same with another motion in space, where it has one.
+    pub(super) fn map_in_space(self, change: impl Fn(&Pose3) -> Pose3) -> Self {
+        match self {
+            Self::Motion(motion) => Self::Motion(change(&motion)),
+            Self::Assumed(motion) => Self::Assumed(change(&motion)),
+            other => other,
         }
     }
 
@@ -42,6 +62,43 @@ impl Odometry {
         };
         let length_m = increment.translation.vector.norm();
         length_m <= FARTHEST_M && increment.rotation.angle().is_finite()
+    }
+}
+
+/// Motion that the odometry of the scans found, over one scan or several.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct MotionOfScans {
+    pub previous_from_current: Pose3,
+    /// Whether any of them does not determine the motion to it.
+    pub is_assumed: bool,
+}
+
+impl MotionOfScans {
+    /// This motion and then the next one.
+    pub fn followed_by(self, next: Self) -> Self {
+        Self {
+            previous_from_current: self.previous_from_current * next.previous_from_current,
+            is_assumed: self.is_assumed || next.is_assumed,
+        }
+    }
+}
+
+impl From<&OdometryEstimate> for MotionOfScans {
+    fn from(estimate: &OdometryEstimate) -> Self {
+        Self {
+            previous_from_current: estimate.previous_from_current,
+            is_assumed: !estimate.is_determined() && estimate.state != StepState::First,
+        }
+    }
+}
+
+impl From<MotionOfScans> for Odometry {
+    fn from(motion: MotionOfScans) -> Self {
+        if motion.is_assumed {
+            Self::Assumed(motion.previous_from_current)
+        } else {
+            Self::Motion(motion.previous_from_current)
+        }
     }
 }
 
@@ -92,7 +149,7 @@ pub fn demonstration_noise() -> OdometryNoise {
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
-    use nalgebra::Vector3;
+    use nalgebra::{Matrix6, Vector3, Vector6};
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
@@ -125,6 +182,33 @@ mod tests {
         let moved: Vec<Pose3> = poses.iter().map(|pose| other_from_world * pose).collect();
         for (a, b) in increments(&poses).iter().zip(&increments(&moved)) {
             assert_relative_eq!(a, b, epsilon = 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_motion_over_scans_is_assumed_if_one_of_them_does_not_determine_its_part() {
+        let estimate = |state: StepState, directions: usize| OdometryEstimate {
+            odom_from_lidar: Pose3::identity(),
+            previous_from_current: Pose3::translation(1.0, 0.0, 0.0),
+            duration_s: 0.1,
+            covariance: Matrix6::zeros(),
+            state,
+            degenerate_directions: vec![Vector6::x(); directions],
+            residual_m: None,
+            matched_share: 1.0,
+            elapsed: std::time::Duration::ZERO,
+        };
+        let over = |steps: &[(StepState, usize)]| {
+            let motions = (steps.iter()).map(|&(state, count)| (&estimate(state, count)).into());
+            Odometry::from(motions.fold(MotionOfScans::default(), MotionOfScans::followed_by))
+        };
+        let of = |metres| Pose3::translation(metres, 0.0, 0.0);
+        use StepState::{Doubtful, First, Lost, Predicted, Registered};
+        let found = over(&[(First, 0), (Registered, 0)]);
+        assert_eq!(found, Odometry::Motion(of(2.0)));
+        for weak in [(Registered, 1), (Doubtful, 0), (Predicted, 0), (Lost, 0)] {
+            let found = over(&[(Registered, 0), weak, (Registered, 0)]);
+            assert_eq!(found, Odometry::Assumed(of(3.0)));
         }
     }
 

@@ -6,7 +6,7 @@ use glam::DVec3;
 use nalgebra::Point2;
 
 use super::error::TrackerError;
-use super::odometry::Odometry;
+use super::odometry::MotionOfScans;
 use super::tracker::Tracker;
 use super::tracking_loss::State;
 use crate::geometry::Pose3;
@@ -61,9 +61,8 @@ impl SecondDrive {
     /// Times of scans do not ascend, the points do not fit the sensor, or the map cannot be rendered.
     pub fn add(&mut self, scan: &Scan) -> Result<State, SecondDriveError> {
         self.found.push(None);
-        let motion = self.builder.add(scan)?.previous_from_current;
-        let odometry = Odometry::Motion(motion);
-        let estimate = self.tracker.step_with_motion(scan, odometry)?;
+        let motion = MotionOfScans::from(self.builder.add(scan)?);
+        let estimate = self.tracker.step_with_motion(scan, motion.into())?;
         let is_found = estimate.state == State::Tracking && estimate.on_mapped_ground;
         if let Some(last) = self.found.last_mut() {
             *last = is_found.then_some(estimate.map_from_lidar);

@@ -16,9 +16,8 @@ use super::error::TrackerError;
 use super::estimate::Estimate;
 use super::front_end::{FrontEnd, Measured};
 use super::localizer::{Localizer, Start};
-use super::odometry::Odometry;
+use super::odometry::{MotionOfScans, Odometry};
 use super::tracking_loss::State;
-use crate::geometry::Pose3;
 use crate::lidar::Scan;
 use crate::map::Map;
 use crate::odometry::OdometryConfig;
@@ -75,7 +74,7 @@ impl Tracker {
                 config: config.localizer,
                 seed: config.seed,
                 start: Start::unknown(map),
-                since_localized: Pose3::identity(),
+                since_localized: MotionOfScans::default(),
                 localizer: None,
                 distortions: DistortionSearch::default(),
             },
@@ -192,7 +191,7 @@ pub struct BackEnd {
     seed: u64,
     start: Start,
     /// Motion since the last scan that was localized, over those that could not be.
-    since_localized: Pose3,
+    since_localized: MotionOfScans,
     /// `None` before the first scan.
     localizer: Option<Localizer>,
     /// Not used where the start is known.
@@ -202,9 +201,8 @@ pub struct BackEnd {
 impl BackEnd {
     /// The motion into a scan since the last one that was localized, as the scans show it.
     pub fn motion_into(&self, measured: &Measured) -> Odometry {
-        (measured.previous_from_current).map_or(Odometry::Unknown, |motion| {
-            Odometry::Motion(self.since_localized * motion)
-        })
+        let motion = |of_scan| self.since_localized.followed_by(of_scan).into();
+        measured.motion.map_or(Odometry::Unknown, motion)
     }
 
     /// Estimates `map_from_lidar` at the moment of the next scan, given the motion since the last one that was localized.
@@ -232,7 +230,7 @@ impl BackEnd {
                 return Err(error.into());
             }
         };
-        self.since_localized = Pose3::identity();
+        self.since_localized = MotionOfScans::default();
         if matches!(self.start, Start::Pose { .. }) {
             return Ok(estimate);
         }
@@ -255,12 +253,13 @@ impl BackEnd {
 
     /// Remembers the motion into a scan that is not localized.
     fn leave_out(&mut self, measured: &Measured) {
-        self.since_localized *= measured.previous_from_current.unwrap_or_default();
+        let motion = measured.motion.unwrap_or_default();
+        self.since_localized = self.since_localized.followed_by(motion);
     }
 
     fn restart(&mut self, start: Start) {
         self.start = start;
-        self.since_localized = Pose3::identity();
+        self.since_localized = MotionOfScans::default();
         self.localizer = None;
         self.distortions = DistortionSearch::default();
     }

@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::*;
-use crate::geometry::Pose2;
+use crate::geometry::{Pose2, Pose3};
 use crate::localization::{Distortion, StartSpread, State};
 use crate::map::world_for_tests::TestWorld;
 use crate::odometry::Odometer;

@@ -4,7 +4,7 @@
 //! contradict those of the scans; see [`ImuCalibration::estimate`].
 
 use super::config::OdometryConfig;
-use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
+use super::odometer::{Odometer, OdometryError, OdometryEstimate};
 use crate::inertial::{Gyroscope, Imu, ImuCalibration, ImuRejection, MeasuredTurn};
 use crate::lidar::Scan;
 use crate::validation::InvalidValue;
@@ -91,7 +91,7 @@ pub(super) fn measured_turn(
     step: &OdometryEstimate,
     (from_s, to_s): (f64, f64),
 ) -> Option<MeasuredTurn> {
-    let is_known = step.state == StepState::Registered && step.degenerate_directions.is_empty();
+    let is_known = step.is_determined();
     is_known.then_some(MeasuredTurn {
         from_s,
         to_s,

@@ -194,6 +194,11 @@ fn advance(
 }
 
 impl OdometryEstimate {
+    /// Whether the scan determines the motion to it in all directions, and without a surprise.
+    pub fn is_determined(&self) -> bool {
+        self.state == StepState::Registered && self.degenerate_directions.is_empty()
+    }
+
     /// An estimate without motion.
     pub(super) fn first(duration_s: f64) -> Self {
         Self {

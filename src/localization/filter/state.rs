@@ -163,7 +163,7 @@ impl ParticleFilter {
         let Some(last) = self.in_space.filter(|_| proposes) else {
             return Ok(None);
         };
-        let Odometry::Motion(motion) = odometry else {
+        let Some(motion) = odometry.in_space() else {
             return Ok(Some(last.attitude));
         };
         let map_from_lidar = last.map_from_lidar * motion;

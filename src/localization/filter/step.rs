@@ -52,8 +52,9 @@ impl ParticleFilter {
         };
         let mut compared = self.compared(&update)?;
         if let Some(predicted) = predicted
-            && (self.agreement)
-                .suggests_another_pose(compared.agreement, &self.config.tracking_loss)
+            && (matches!(odometry, Odometry::Assumed(_))
+                || (self.agreement)
+                    .suggests_another_pose(compared.agreement, &self.config.tracking_loss))
         {
             let updated = mem::replace(&mut self.particles, predicted);
             let here = compared.in_space.map_from_lidar;
@@ -145,15 +146,15 @@ impl ParticleFilter {
         })
     }
 
-    /// Without odometry every scan is used: nothing else shows whether the car moves. So is one after a refuted prediction.
+    /// Without measured odometry every scan is used: nothing else shows whether the car moves. So is one after a refuted prediction.
     fn is_update_due(&self, odometry: Odometry) -> bool {
         let is_due = |pending: &Pending| {
             pending.motion.translation.vector.norm() > self.config.move_thres_m
                 || pending.motion.rotation.angle().abs() > self.config.turn_thres_rad
                 || self.is_less_certain(pending, odometry)
         };
-        let needs_scan = odometry == Odometry::Unknown || self.updated.refuted;
-        needs_scan || self.pending.as_ref().is_none_or(is_due)
+        let is_assumed = matches!(odometry, Odometry::Unknown | Odometry::Assumed(_));
+        is_assumed || self.updated.refuted || self.pending.as_ref().is_none_or(is_due)
     }
 
     /// Whether a pose that is tracked and registered is less certain, by the motion since the last update, than that left it.
@@ -220,7 +221,9 @@ impl ParticleFilter {
             let periods = self.duration_s / PERIOD_S;
             let noise = match (odometry, &self.last_motion) {
                 (Odometry::Unknown, None) => config.unknown_velocity.scaled(periods),
-                (Odometry::Unknown, Some(_)) => config.constant_velocity.scaled(periods),
+                (Odometry::Unknown, Some(_)) | (Odometry::Assumed(_), _) => {
+                    config.constant_velocity.scaled(periods)
+                }
                 _ => config.motion.clone(),
             };
             self.particles

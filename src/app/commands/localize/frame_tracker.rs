@@ -191,13 +191,14 @@ impl FrameLocalizer<'_> {
             Some((last, time_s)) => (last + 1, time_s),
             None => (row, frame.time_s),
         };
-        let motion = match (given, back.motion_into(measured)) {
-            (Some(given), _) => Some(given),
-            (None, Odometry::Motion(motion)) => Some(FrameMotion::from_motion(motion)),
-            _ => self.motion.given_over(since..row + 1),
-        };
+        let of_scans = back.motion_into(measured);
+        let motion = (given.or_else(|| of_scans.in_space().map(FrameMotion::from_motion)))
+            .or_else(|| self.motion.given_over(since..row + 1));
         let times_s = [before_s, frame.time_s];
-        let odometry = odometry_into(self.opened.config.motion_model, motion, times_s);
+        let odometry = match (given, of_scans) {
+            (None, Odometry::Assumed(_)) => of_scans,
+            _ => odometry_into(self.opened.config.motion_model, motion, times_s),
+        };
         let estimate = back.step(scan, measured, odometry)?;
         self.last = Some((row, frame.time_s));
         let runtime = started.elapsed();
