@@ -510,6 +510,7 @@ fn the_motion_between_updates_is_known_if_the_pose_was_certain_at_both() {
             ground: None,
             pose: None,
             refutes,
+            is_best: false,
         };
         let compared = filter.compared(&update).unwrap();
         filter.updated_estimate(&update, compared).unwrap();

@@ -17,6 +17,7 @@
 mod phase;
 mod state;
 
+mod around;
 mod coast;
 mod propose;
 mod resample;

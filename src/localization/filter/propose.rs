@@ -45,6 +45,22 @@ pub(super) struct Posterior {
     pub(super) ground: GroundPatch,
     /// Whether the registration refutes the prediction, or replaces one that no scan confirmed.
     pub(super) refutes: bool,
+    /// Poses in the place, the registered one among them, that fit as well, if it was searched.
+    alike: Vec<Pose3>,
+}
+
+/// What a search around the prediction shows of the pose to which a scan led.
+pub(super) enum Searched {
+    /// No other pose fits as well.
+    Best,
+    /// Others fit as well.
+    Alike,
+    /// Another one fits better: the sensor moved otherwise than predicted.
+    Elsewhere {
+        posterior: Box<Posterior>,
+        /// Whether no other pose fits as well as that one.
+        is_best: bool,
+    },
 }
 
 impl ParticleFilter {
@@ -108,26 +124,51 @@ impl ParticleFilter {
         self.propose_in(scan, attitude, place, rng)
     }
 
-    /// The same where a scan fits much better elsewhere around the prediction than at a pose in space to which it led: the sensor moved
-    /// otherwise than predicted.
-    pub(super) fn propose_elsewhere(
+    /// Searches the surroundings of the prediction for poses that fit as well as one in space to which a scan led, or better, by the mean
+    /// costs of the same beams.
+    pub(super) fn search_around(
         &self,
         scan: &RangeImage,
         attitude: (&SensorAttitude, Option<Pose3>),
-        map_from_lidar: &Pose3,
+        here: &Pose3,
         rng: &mut impl Rng,
-    ) -> Result<Option<Posterior>, RenderError> {
+    ) -> Result<Searched, RenderError> {
+        /// Distance from which on a pose is another one: its position is wrong if the first one is right [m].
+        const OTHER_M: f64 = 0.5;
         let place = Basin::Place { is_searched: true };
         let Some(found) = self.propose_in(scan, attitude, place, rng)? else {
-            return Ok(None);
+            return Ok(Searched::Best);
         };
+        let are_apart =
+            |a: &Pose3, b: &Pose3| (a.translation.vector - b.translation.vector).norm() >= OTHER_M;
+        if !found.alike.iter().any(|pose| are_apart(pose, here)) {
+            return Ok(Searched::Best);
+        }
         let there = found.ground.lift(&found.gaussian.mean, &found.attitude);
-        let beams = (&found.beams[..], &found.attitude);
-        let is_better = self.is_refuted(map_from_lidar, &there, beams)?;
-        Ok(is_better.then_some(Posterior {
-            refutes: true,
-            ..found
-        }))
+        let (both, observation) = ([Some(*here), Some(there)], &self.config.observation);
+        let costs_m = costs_of_scan(
+            &*self.map.renderer,
+            &both,
+            (scan, &found.beams),
+            observation,
+        )?;
+        let [here_m, there_m] = [costs_m[0], costs_m[1]].map(|m| m.unwrap_or(f64::INFINITY));
+        let tolerance_m = self.config.places.tolerance_m;
+        Ok(
+            if there_m + tolerance_m < here_m && are_apart(&there, here) {
+                Searched::Elsewhere {
+                    is_best: !found.alike.iter().any(|pose| are_apart(pose, &there)),
+                    posterior: Box::new(Posterior {
+                        refutes: true,
+                        ..found
+                    }),
+                }
+            } else if there_m <= here_m + tolerance_m {
+                Searched::Alike
+            } else {
+                Searched::Best
+            },
+        )
     }
 
     /// Registers the scan in a basin, and fuses the result with the prediction.
@@ -158,6 +199,7 @@ impl ParticleFilter {
         let predicted = patch.lift(&mean, attitude);
         let renderer = &*self.map.renderer;
         let registration = self.registration();
+        let mut alike = Vec::new();
         let start = match basin {
             Basin::Pose { start } => start.filter(|start| is_plausible(&pose2_from_pose3(start))),
             Basin::Place { is_searched } => {
@@ -166,7 +208,8 @@ impl ParticleFilter {
                     let above = (&patch, attitude);
                     starts.extend(self.starts_around(&mean, (scan, &returns), above, rng)?);
                 }
-                self.best_registered(&starts, &mean, scan, (&registered, &beams))?
+                alike = self.best_registered(&starts, &mean, scan, (&registered, &beams))?;
+                alike.first().copied()
             }
         };
         let start = match start {
@@ -213,74 +256,8 @@ impl ParticleFilter {
             attitude,
             ground: patch,
             refutes,
+            alike,
         }))
-    }
-
-    /// Poses in the place of a pose with which a scan is most consistent, at least a metre apart, each at the height and the attitude of the
-    /// sensor above the ground.
-    fn starts_around(
-        &self,
-        place: &Pose2,
-        (scan, returns): (&RangeImage, &ClassifiedReturns),
-        (patch, attitude): (&GroundPatch, &SensorAttitude),
-        rng: &mut impl Rng,
-    ) -> Result<Vec<Pose3>, RenderError> {
-        /// Number of poses that are compared with the scan: within two standard deviations in a place of 5 m one per half a metre and
-        /// tenth of a radian.
-        const POSES: usize = 2000;
-        /// Number of beams of each comparison.
-        const BEAMS: usize = 100;
-        /// Largest number of poses that are returned.
-        const STARTS: usize = 8;
-        let beams = returns.choose(BEAMS, self.config.proposal.road_share, rng);
-        let radius_m = self.config.places.radius_m;
-        let covariance = within_place(None, radius_m);
-        let Some(around) = covariance.and_then(|it| Gaussian::new(*place, it)) else {
-            return Ok(Vec::new());
-        };
-        let mut poses = around.sample(POSES, rng);
-        poses.retain(|pose| is_same(place, pose, radius_m));
-        let lift = |pose: &Pose2| {
-            let shift_m = pose.translation.vector - place.translation.vector;
-            Some(patch.shifted(&shift_m).lift(pose, attitude))
-        };
-        let lifted: Vec<Option<Pose3>> = poses.iter().map(lift).collect();
-        let observation = &self.config.observation;
-        let costs_m = costs_of_scan(&*self.map.renderer, &lifted, (scan, &beams), observation)?;
-        let best = best_of_each(&poses, &costs_m, STARTS, APART_M);
-        Ok(best.into_iter().filter_map(|index| lifted[index]).collect())
-    }
-
-    /// The best of the poses to which beams are registered from some starts in a place: of those whose costs exceed the least by no more
-    /// than the tolerance of places, the nearest to the centre of the place. `None` if no registration succeeds.
-    fn best_registered(
-        &self,
-        starts: &[Pose3],
-        place: &Pose2,
-        scan: &RangeImage,
-        (registered, compared): (&[Beam], &[Beam]),
-    ) -> Result<Option<Pose3>, RenderError> {
-        let step = registered.len().div_ceil(PLACE_BEAMS).max(1);
-        let some: Vec<Beam> = registered.iter().step_by(step).copied().collect();
-        let register = |start| self.registered_in_place(&some, start, place);
-        let found: Result<Vec<_>, RenderError> = starts.par_iter().map(register).collect();
-        let found = found?.into_iter().flatten();
-        let poses: Vec<_> = found.map(|found| Some(found.map_from_lidar)).collect();
-        if let [only] = poses[..] {
-            return Ok(only);
-        }
-        let observation = &self.config.observation;
-        let costs_m = costs_of_scan(&*self.map.renderer, &poses, (scan, compared), observation)?;
-        let least_m = (costs_m.iter().flatten()).fold(f64::INFINITY, |least, m| least.min(*m));
-        let most_m = least_m + self.config.places.tolerance_m;
-        let away_m = |pose: &Pose3| {
-            let shift_m = pose2_from_pose3(pose).translation.vector - place.translation.vector;
-            shift_m.norm()
-        };
-        let both = poses.into_iter().zip(costs_m);
-        let fitting = both.filter(|(_, cost_m)| cost_m.is_some_and(|cost_m| cost_m <= most_m));
-        let poses = fitting.filter_map(|(pose, _)| pose);
-        Ok(poses.min_by(|a, b| away_m(a).total_cmp(&away_m(b))))
     }
 
     /// Whether a registered pose shows that the predicted one is wrong, as after a place that was confirmed by a pose next to
@@ -315,6 +292,7 @@ impl ParticleFilter {
             ground: Some(posterior.ground),
             pose,
             refutes: posterior.refutes,
+            is_best: false,
         }
     }
 }
@@ -322,6 +300,7 @@ impl ParticleFilter {
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
+    use glam::Vec3;
     use nalgebra::Vector3;
     use rand::{SeedableRng as _, rngs::StdRng};
 
@@ -410,8 +389,19 @@ mod tests {
         assert!(error_m(truth, 0.1, off) < 0.01);
     }
 
+    /// A pose beside a house without a car or a pole, its scan, and the part of the scan that looks alike along the wall.
+    fn beside_a_wall(world: &TestWorld) -> (Pose2, [RangeImage; 2]) {
+        let pose = world.pose_at(22.0, 0.2, 0.05);
+        let whole = world.scan(&pose);
+        let is_of_wall = |point: &Vec3| point.y < 0.0 && point.x.abs() < 1.0;
+        let ranges_m = (whole.points.iter().zip(&whole.ranges))
+            .map(|(point, &range_m)| if is_of_wall(point) { range_m } else { 0.0 });
+        let of_wall = RangeImage::from_ranges(ranges_m.collect(), &whole.model);
+        (pose, [whole, of_wall])
+    }
+
     #[test]
-    fn a_registration_that_refutes_the_prediction_replaces_it_and_the_next_scan_confirms_it() {
+    fn a_registration_that_refutes_the_prediction_replaces_it_where_no_other_pose_fits_as_well() {
         let world = TestWorld::street();
         let truth = world.pose_at(12.0, 0.2, 0.05);
         let attitude = SensorAttitude::default();
@@ -420,13 +410,13 @@ mod tests {
         let prior = Gaussian::new(truth * Pose2::translation(0.0, 0.4), covariance).unwrap();
         let mut rng = StdRng::seed_from_u64(1);
         let mut filter = tracking(&world, &prior, &mut rng);
-        let states = [0; 3].map(|_| {
+        for refuted in [true, false, false] {
             let estimate = filter.step(Odometry::Unknown, &scan, &attitude, &mut rng);
             let estimate = estimate.unwrap();
             assert!(deviation(&estimate.pose, &truth).xy().norm() < 0.01);
-            estimate.state
-        });
-        assert_eq!(states, [State::Searching, State::Tracking, State::Tracking]);
+            assert_eq!(estimate.state, State::Tracking);
+            assert_eq!(filter.updated.refuted, refuted);
+        }
     }
 
     #[test]
@@ -458,6 +448,14 @@ mod tests {
         assert!(!refutes(0.6, 0.0, &shortened.collect::<Vec<_>>()));
     }
 
+    /// The other pose to which a search leads, if there is one.
+    fn other(searched: Searched) -> Option<Pose2> {
+        match searched {
+            Searched::Elsewhere { posterior, .. } => Some(posterior.gaussian.mean),
+            Searched::Best | Searched::Alike => None,
+        }
+    }
+
     #[test]
     fn a_scan_that_fits_much_better_next_to_a_tracked_pose_is_used_there() {
         let world = TestWorld::street();
@@ -470,8 +468,8 @@ mod tests {
             let mut rng = StdRng::seed_from_u64(1);
             let mut filter = tracking(&world, &prior, &mut rng);
             let lifted = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
-            let found = filter.propose_elsewhere(&scan, (&attitude, None), &lifted, &mut rng);
-            let found = found.unwrap().map(|found| found.gaussian.mean);
+            let found = filter.search_around(&scan, (&attitude, None), &lifted, &mut rng);
+            let found = other(found.unwrap());
             assert_eq!(found.is_some(), off_m != 0.0, "{off_m}");
             if let Some(found) = found {
                 assert_relative_eq!(found, truth, epsilon = 5e-3);
@@ -485,33 +483,31 @@ mod tests {
                 .step(Odometry::Unknown, &scan, &attitude, &mut rng)
                 .unwrap();
             assert_relative_eq!(frame.pose, truth, epsilon = 5e-3);
-            let is_confirmed = frame.state == State::Tracking;
-            assert_eq!(is_confirmed, off_m == 0.0, "{off_m}");
+            // No other pose fits as well.
+            assert_eq!(frame.state, State::Tracking, "{off_m}");
+            assert_eq!(filter.updated.refuted, off_m != 0.0, "{off_m}");
         }
     }
 
     #[test]
-    fn starts_on_a_slope_are_at_the_height_of_the_sensor_above_it() {
+    fn after_an_assumed_motion_a_frame_is_tracked_where_no_other_pose_fits_as_well() {
         let world = TestWorld::street();
-        let truth = world.pose_at(12.0, 0.2, 0.05);
-        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
-        let prior = Gaussian::new(truth, nalgebra::Matrix3::identity() * 1e-4).unwrap();
-        let mut rng = StdRng::seed_from_u64(1);
-        let filter = tracking(&world, &prior, &mut rng);
-        let slope = GroundPatch {
-            height_m: 0.0,
-            normal: Vector3::new(-0.1, 0.05, 1.0).normalize(),
-        };
-        let returns = ClassifiedReturns::new(&scan, &attitude);
-        let above = (&slope, &attitude);
-        let starts = filter.starts_around(&truth, (&scan, &returns), above, &mut rng);
-        let starts = starts.unwrap();
-        assert!(starts.len() > 1);
-        for start in starts {
-            let shift_m = start.translation.vector.xy() - truth.translation.vector;
-            let height_m = start.translation.z - (0.1 * shift_m.x - 0.05 * shift_m.y);
-            let expected_m = attitude.height_m / slope.normal.z;
-            assert_relative_eq!(height_m, expected_m, epsilon = 1e-6);
+        let (truth, [whole, of_wall]) = beside_a_wall(&world);
+        let attitude = SensorAttitude::default();
+        let stands = Pose3::identity();
+        for (scan, odometry, is_confirmed) in [
+            (&whole, Odometry::Motion(stands), true),
+            (&whole, Odometry::Assumed(stands), true),
+            (&of_wall, Odometry::Motion(stands), true),
+            (&of_wall, Odometry::Assumed(stands), false),
+        ] {
+            let prior = Gaussian::new(truth, nalgebra::Matrix3::identity() * 1e-4).unwrap();
+            let mut rng = StdRng::seed_from_u64(1);
+            let mut filter = tracking(&world, &prior, &mut rng);
+            let frame = filter.step(odometry, scan, &attitude, &mut rng).unwrap();
+            let is_tracking = frame.state == State::Tracking;
+            assert_eq!(is_tracking, is_confirmed, "{odometry:?}");
+            assert_eq!(filter.updated.refuted, !is_confirmed, "{odometry:?}");
         }
     }
 
@@ -529,10 +525,32 @@ mod tests {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
             let found = pool
                 .unwrap()
-                .install(|| filter.propose_elsewhere(&scan, (&attitude, None), &lifted, &mut rng));
-            found.unwrap().map(|found| found.gaussian.mean)
+                .install(|| filter.search_around(&scan, (&attitude, None), &lifted, &mut rng));
+            other(found.unwrap())
         });
         assert!(found[0].is_some() && found[0] == found[1]);
+    }
+
+    #[test]
+    fn a_pose_elsewhere_with_which_too_few_beams_agree_is_confirmed_by_the_next_scan() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let attitude = SensorAttitude::default();
+        let whole = world.scan(&truth);
+        let ranges_m = (whole.ranges.iter().enumerate())
+            .map(|(pixel, range_m)| range_m * if pixel % 3 == 0 { 0.9 } else { 1.0 });
+        let shortened = RangeImage::from_ranges(ranges_m.collect(), &whole.model);
+        let pose = truth * Pose2::translation(2.0, 0.0);
+        let prior = Gaussian::new(pose, nalgebra::Matrix3::identity() * 1e-4).unwrap();
+        let mut rng = StdRng::seed_from_u64(1);
+        let mut filter = tracking(&world, &prior, &mut rng);
+        filter.config.proposal.registration.kernel_m = 0.02;
+        let stands = Odometry::Assumed(Pose3::identity());
+        for (scan, state) in [(&shortened, State::Searching), (&whole, State::Tracking)] {
+            let frame = filter.step(stands, scan, &attitude, &mut rng).unwrap();
+            assert_relative_eq!(frame.pose, truth, epsilon = 0.01);
+            assert_eq!(frame.state, state, "{:?}", frame.agreement);
+        }
     }
 
     #[test]

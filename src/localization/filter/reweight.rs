@@ -26,6 +26,15 @@ pub(super) struct Update {
     pub(super) pose: Option<Pose2>,
     /// Whether the scan shows that the prediction is wrong, or replaces one that no scan confirmed.
     pub(super) refutes: bool,
+    /// Whether a search around the prediction found no other pose that fits as well.
+    pub(super) is_best: bool,
+}
+
+impl Update {
+    /// Whether the next scan has to confirm the pose.
+    pub fn needs_confirmation(&self) -> bool {
+        self.refutes && !self.is_best
+    }
 }
 
 /// The pose of an update in space, and its agreement with the map.
@@ -82,6 +91,7 @@ impl ParticleFilter {
                     ground: None,
                     pose: None,
                     refutes: false,
+                    is_best: false,
                 });
             }
             self.resample(rng);

@@ -103,6 +103,7 @@ impl ParticleFilter {
             ground: Some(places[best].patch),
             pose: Some(*places[best].pose()),
             refutes: false,
+            is_best: false,
         }))
     }
 

@@ -6,6 +6,7 @@ use nalgebra::Matrix3;
 use rand::Rng;
 
 use super::phase::{Evidence, Phase, Search};
+use super::propose::Searched;
 use super::reweight::{Compared, Update};
 use super::state::{ParticleFilter, Pending};
 use crate::geometry::{Pose2, Pose3};
@@ -51,25 +52,35 @@ impl ParticleFilter {
             None => self.reweight_widely(scan, attitude, rng)?,
         };
         let mut compared = self.compared(&update)?;
-        if let Some(predicted) = predicted
-            && (matches!(odometry, Odometry::Assumed(_))
-                || (self.agreement)
-                    .suggests_another_pose(compared.agreement, &self.config.tracking_loss))
-        {
+        let config = &self.config.tracking_loss;
+        let is_suspect = matches!(odometry, Odometry::Assumed(_))
+            || self.updated.refuted
+            || update.refutes
+            || (self.agreement).suggests_another_pose(compared.agreement, config);
+        if let Some(predicted) = predicted.filter(|_| is_suspect) {
             let updated = mem::replace(&mut self.particles, predicted);
             let here = compared.in_space.map_from_lidar;
-            match self.propose_elsewhere(scan, (attitude, self.predicted), &here, rng)? {
-                Some(elsewhere) => {
-                    update = self.sample(elsewhere, rng);
-                    compared = self.compared(&update)?;
+            match self.search_around(scan, (attitude, self.predicted), &here, rng)? {
+                Searched::Best => {
+                    self.particles = updated;
+                    update.is_best = true;
                 }
-                None => self.particles = updated,
+                Searched::Alike => {
+                    self.particles = updated;
+                    update.refutes = true;
+                }
+                Searched::Elsewhere { posterior, is_best } => {
+                    update = self.sample(*posterior, rng);
+                    compared = self.compared(&update)?;
+                    let sure_agreement = self.config.tracking_loss.sure_agreement;
+                    update.is_best = is_best && compared.agreement >= Some(sure_agreement);
+                }
             }
         }
         let mut estimate = self.updated_estimate(&update, compared)?;
         // The share of this scan is judged by those before it.
         let earlier_agreement = self.agreement;
-        let mut evidence = self.evidence(&estimate, odometry, update.refutes);
+        let mut evidence = self.evidence(&estimate, odometry, update.needs_confirmation());
         let is_found = evidence.is_confirmed && !self.phase.is_tracking();
         let found_at = (&update.attitude, Some(estimate.map_from_lidar));
         if is_found && let Some(posterior) = self.propose(scan, found_at, None, rng)? {
@@ -90,7 +101,7 @@ impl ParticleFilter {
                 }
             }
         }
-        if update.refutes {
+        if update.needs_confirmation() {
             evidence = evidence.refuted();
         }
         self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
