@@ -1,8 +1,10 @@
-//! Poses around a prediction with which a scan is consistent.
+//! Search around a prediction: whether other poses fit as well as that to which a registration led, or better.
 
 use rand::Rng;
 use rayon::prelude::*;
 
+use super::propose::{Basin, Posterior};
+use super::reweight::Others;
 use super::search::{APART_M, PLACE_BEAMS, within_place};
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
@@ -14,6 +16,57 @@ use crate::map::{GroundPatch, SensorAttitude};
 use crate::rendering::RenderError;
 
 impl ParticleFilter {
+    /// Compares the pose in space to which a scan led with others around the prediction, by the mean costs of the same beams. Returns
+    /// the distribution around a better one, if there is one, and how others fit.
+    pub(super) fn search_around(
+        &self,
+        scan: &RangeImage,
+        attitude: (&SensorAttitude, Option<Pose3>),
+        here: &Pose3,
+        rng: &mut impl Rng,
+    ) -> Result<(Option<Posterior>, Others), RenderError> {
+        /// Distance from which on a pose is another one: its position is wrong if the first one is right [m].
+        const OTHER_M: f64 = 0.5;
+        let place = Basin::Place { is_searched: true };
+        let found = self.propose_in(scan, attitude, place, rng)?;
+        let Some(found) = found.filter(|found| !found.alike.is_empty()) else {
+            return Ok((None, Others::Unknown));
+        };
+        let (beams, observation) = (&found.beams, &self.config.observation);
+        let costs_m = costs_of_scan(
+            &*self.map.renderer,
+            &[Some(*here)],
+            (scan, beams),
+            observation,
+        )?;
+        let here_m = costs_m[0].unwrap_or(f64::INFINITY);
+        let least_m = (found.alike.iter()).fold(f64::INFINITY, |least, (_, m)| least.min(*m));
+        let tolerance_m = self.config.places.tolerance_m;
+        let is_better = least_m + tolerance_m < here_m;
+        let (best, most_m) = if is_better {
+            (found.alike[0].0, f64::INFINITY)
+        } else {
+            (*here, here_m + tolerance_m)
+        };
+        let is_other = |(pose, cost_m): &(Pose3, f64)| {
+            let apart_m = (pose.translation.vector - best.translation.vector).norm();
+            apart_m >= OTHER_M && *cost_m <= most_m
+        };
+        let radius_m = self.config.places.radius_m;
+        let others = if found.alike.iter().any(is_other) {
+            Others::Alike
+        } else if is_same(&self.particles.mean(), &pose2_from_pose3(&best), radius_m) {
+            Others::Worse
+        } else {
+            Others::Unknown
+        };
+        let better = is_better.then_some(Posterior {
+            refutes: true,
+            ..found
+        });
+        Ok((better, others))
+    }
+
     /// Poses in the place of a pose with which a scan is most consistent, at least a metre apart, each at the height and the attitude of the
     /// sensor above the ground.
     pub(super) fn starts_around(
@@ -49,24 +102,21 @@ impl ParticleFilter {
         Ok(best.into_iter().filter_map(|index| lifted[index]).collect())
     }
 
-    /// The best of the poses to which beams are registered from some starts in a place: those whose costs exceed the least by no more
-    /// than the tolerance of places, beginning with the nearest to the centre of the place. None if no registration succeeds.
-    pub(super) fn best_registered(
+    /// The best of the poses to which beams are registered from some starts in a place, with their costs [m]: those whose costs exceed
+    /// the least by no more than the tolerance of places, beginning with the nearest to the centre of the place.
+    pub(super) fn best_in_place(
         &self,
         starts: &[Pose3],
         place: &Pose2,
         scan: &RangeImage,
         (registered, compared): (&[Beam], &[Beam]),
-    ) -> Result<Vec<Pose3>, RenderError> {
+    ) -> Result<Vec<(Pose3, f64)>, RenderError> {
         let step = registered.len().div_ceil(PLACE_BEAMS).max(1);
         let some: Vec<Beam> = registered.iter().step_by(step).copied().collect();
         let register = |start| self.registered_in_place(&some, start, place);
         let found: Result<Vec<_>, RenderError> = starts.par_iter().map(register).collect();
         let found = found?.into_iter().flatten();
         let poses: Vec<_> = found.map(|found| Some(found.map_from_lidar)).collect();
-        if let [Some(only)] = poses[..] {
-            return Ok(vec![only]);
-        }
         let observation = &self.config.observation;
         let costs_m = costs_of_scan(&*self.map.renderer, &poses, (scan, compared), observation)?;
         let least_m = (costs_m.iter().flatten()).fold(f64::INFINITY, |least, m| least.min(*m));
@@ -76,22 +126,159 @@ impl ParticleFilter {
             shift_m.norm()
         };
         let both = poses.into_iter().zip(costs_m);
-        let fitting = both.filter(|(_, cost_m)| cost_m.is_some_and(|cost_m| cost_m <= most_m));
-        let mut poses: Vec<Pose3> = fitting.filter_map(|(pose, _)| pose).collect();
-        poses.sort_by(|a, b| away_m(a).total_cmp(&away_m(b)));
-        Ok(poses)
+        let both = both.filter_map(|(pose, cost_m)| pose.zip(cost_m));
+        let mut fitting: Vec<(Pose3, f64)> = both.filter(|(_, cost_m)| *cost_m <= most_m).collect();
+        fitting.sort_by(|(a, _), (b, _)| away_m(a).total_cmp(&away_m(b)));
+        Ok(fitting)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
-    use nalgebra::Vector3;
+    use glam::Vec3;
+    use nalgebra::{Matrix3, Vector3};
     use rand::{SeedableRng, rngs::StdRng};
 
+    use super::super::phase::Phase;
     use super::*;
-    use crate::localization::{LocalizerConfig, ParticleSet};
+    use crate::localization::odometry::Odometry;
+    use crate::localization::{LocalizerConfig, ParticleSet, State};
     use crate::map::world_for_tests::TestWorld;
+
+    /// A filter that tracks a pose, with a standard deviation of a centimetre and of half a degree.
+    fn tracking(world: &TestWorld, pose: &Pose2, rng: &mut StdRng) -> ParticleFilter {
+        let prior = Gaussian::new(*pose, Matrix3::identity() * 1e-4).unwrap();
+        let particles = ParticleSet::uniform(prior.sample(100, rng));
+        let config = LocalizerConfig::of_test(100);
+        let mut filter = ParticleFilter::new(config, world.map(), None, particles).unwrap();
+        filter.phase = Phase::Tracking;
+        filter
+    }
+
+    /// A pose next to a house without a car or a pole, its scan, and the part of the scan that looks alike along the wall.
+    fn next_to_a_wall(world: &TestWorld) -> (Pose2, [RangeImage; 2]) {
+        let pose = world.pose_at(22.0, 0.2, 0.05);
+        let whole = world.scan(&pose);
+        let is_of_wall = |point: &Vec3| point.y < 0.0 && point.x.abs() < 1.0;
+        let ranges_m = (whole.points.iter().zip(&whole.ranges))
+            .map(|(point, &range_m)| if is_of_wall(point) { range_m } else { 0.0 });
+        let of_wall = RangeImage::from_ranges(ranges_m.collect(), &whole.model);
+        (pose, [whole, of_wall])
+    }
+
+    #[test]
+    fn a_scan_that_fits_much_better_next_to_a_tracked_pose_is_used_there() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let scan = world.scan(&truth);
+        let attitude = SensorAttitude::default();
+        for (off_m, turned_rad) in [(0.0, 0.0), (0.8, 0.0), (-0.8, 0.0), (2.5, 0.0), (2.0, 0.3)] {
+            let pose = truth * Pose2::new(nalgebra::Vector2::new(off_m, 0.0), turned_rad);
+            let mut rng = StdRng::seed_from_u64(1);
+            let mut filter = tracking(&world, &pose, &mut rng);
+            let lifted = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
+            let found = filter.search_around(&scan, (&attitude, None), &lifted, &mut rng);
+            let found = found.unwrap().0.map(|found| found.gaussian.mean);
+            assert_eq!(found.is_some(), off_m != 0.0, "{off_m}");
+            if let Some(found) = found {
+                assert_relative_eq!(found, truth, epsilon = 5e-3);
+            }
+            // A registration with a narrow kernel does not lead there.
+            filter.config.proposal.registration.kernel_m = 0.02;
+            filter
+                .agreement
+                .observe(Some(0.98), &filter.config.tracking_loss);
+            let frame = filter
+                .step(Odometry::Unknown, &scan, &attitude, &mut rng)
+                .unwrap();
+            assert_relative_eq!(frame.pose, truth, epsilon = 5e-3);
+            // No other pose fits as well.
+            assert_eq!(frame.state, State::Tracking, "{off_m}");
+            assert_eq!(filter.updated.refuted, off_m != 0.0, "{off_m}");
+        }
+    }
+
+    #[test]
+    fn after_an_assumed_motion_a_frame_is_tracked_where_no_other_pose_fits_as_well() {
+        let world = TestWorld::street();
+        let (truth, [whole, of_wall]) = next_to_a_wall(&world);
+        let attitude = SensorAttitude::default();
+        let stands = Pose3::identity();
+        for (scan, odometry, is_confirmed) in [
+            (&whole, Odometry::Motion(stands), true),
+            (&whole, Odometry::Assumed(stands), true),
+            (&of_wall, Odometry::Motion(stands), true),
+            (&of_wall, Odometry::Assumed(stands), false),
+        ] {
+            let mut rng = StdRng::seed_from_u64(1);
+            let mut filter = tracking(&world, &truth, &mut rng);
+            let frame = filter.step(odometry, scan, &attitude, &mut rng).unwrap();
+            let is_tracking = frame.state == State::Tracking;
+            assert_eq!(is_tracking, is_confirmed, "{odometry:?}");
+            assert_eq!(filter.updated.is_doubtful, !is_confirmed, "{odometry:?}");
+        }
+    }
+
+    #[test]
+    fn a_search_around_the_prediction_is_the_same_on_any_number_of_threads() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        let pose = truth * Pose2::translation(2.5, 0.0);
+        let found = [1, 4].map(|threads| {
+            let mut rng = StdRng::seed_from_u64(1);
+            let filter = tracking(&world, &pose, &mut rng);
+            let lifted = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+            let found = pool
+                .unwrap()
+                .install(|| filter.search_around(&scan, (&attitude, None), &lifted, &mut rng));
+            found.unwrap().0.map(|found| found.gaussian.mean)
+        });
+        assert!(found[0].is_some() && found[0] == found[1]);
+    }
+
+    #[test]
+    fn a_pose_elsewhere_with_which_too_few_beams_agree_is_confirmed_by_the_next_scan() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let attitude = SensorAttitude::default();
+        let whole = world.scan(&truth);
+        let ranges_m = (whole.ranges.iter().enumerate())
+            .map(|(pixel, range_m)| range_m * if pixel % 3 == 0 { 0.9 } else { 1.0 });
+        let shortened = RangeImage::from_ranges(ranges_m.collect(), &whole.model);
+        let pose = truth * Pose2::translation(2.0, 0.0);
+        let mut rng = StdRng::seed_from_u64(1);
+        let mut filter = tracking(&world, &pose, &mut rng);
+        filter.config.proposal.registration.kernel_m = 0.02;
+        let stands = Odometry::Assumed(Pose3::identity());
+        for (scan, state) in [(&shortened, State::Searching), (&whole, State::Tracking)] {
+            let frame = filter.step(stands, scan, &attitude, &mut rng).unwrap();
+            assert_relative_eq!(frame.pose, truth, epsilon = 0.01);
+            assert_eq!(frame.state, state, "{:?}", frame.agreement);
+        }
+    }
+
+    #[test]
+    fn a_right_pose_with_which_fewer_beams_agree_than_usual_stays() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let scan = world.scan(&truth);
+        let ranges_m = (scan.ranges.iter().enumerate())
+            .map(|(pixel, range_m)| range_m * if pixel % 4 == 0 { 0.9 } else { 1.0 });
+        let scan = RangeImage::from_ranges(ranges_m.collect(), &scan.model);
+        let mut rng = StdRng::seed_from_u64(1);
+        let mut filter = tracking(&world, &truth, &mut rng);
+        let config = filter.config.tracking_loss.clone();
+        filter.agreement.observe(Some(0.98), &config);
+        let attitude = SensorAttitude::default();
+        let frame = filter.step(Odometry::Unknown, &scan, &attitude, &mut rng);
+        let frame = frame.unwrap();
+        assert!(frame.agreement < Some(0.9), "{:?}", frame.agreement);
+        assert_relative_eq!(frame.pose, truth, epsilon = 0.01);
+        assert!(!filter.updated.refuted);
+    }
 
     #[test]
     fn starts_on_a_slope_are_at_the_height_of_the_sensor_above_it() {
@@ -99,9 +286,7 @@ mod tests {
         let truth = world.pose_at(12.0, 0.2, 0.05);
         let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
         let mut rng = StdRng::seed_from_u64(1);
-        let particles = ParticleSet::uniform([truth; 100]);
-        let config = LocalizerConfig::of_test(100);
-        let filter = ParticleFilter::new(config, world.map(), None, particles).unwrap();
+        let filter = tracking(&world, &truth, &mut rng);
         let slope = GroundPatch {
             height_m: 0.0,
             normal: Vector3::new(-0.1, 0.05, 1.0).normalize(),

@@ -8,7 +8,7 @@ use rand::{SeedableRng, rngs::StdRng};
 
 use super::ParticleFilter;
 use super::phase::{Phase, Search};
-use super::reweight::Update;
+use super::reweight::{Others, Update};
 use super::state::{Pending, Updated};
 use crate::geometry::Pose2;
 use crate::lidar::{LidarModel, RangeImage};
@@ -32,6 +32,7 @@ fn tracking(config: LocalizerConfig, pose: Pose2, covariance: Matrix3<f64>) -> P
         covariance,
         is_narrow: true,
         refuted: false,
+        is_doubtful: false,
     };
     filter
 }
@@ -510,7 +511,7 @@ fn the_motion_between_updates_is_known_if_the_pose_was_certain_at_both() {
             ground: None,
             pose: None,
             refutes,
-            is_best: false,
+            others: Others::Unknown,
         };
         let compared = filter.compared(&update).unwrap();
         filter.updated_estimate(&update, compared).unwrap();

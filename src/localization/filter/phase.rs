@@ -18,8 +18,8 @@
 //! Twice as precise, since in a tunnel the standard deviation of the position crosses its limit again and again by the noise of
 //! the walls. A scan that determines the position reduces it to centimetres at once.
 //!
-//! A pose counts as not precise where the scan refutes the prediction, or the pose that the search found, and a search around it
-//! did not show that no other pose fits as well: the next scan has to confirm it.
+//! A pose counts as not precise, so that the next scan has to confirm it, where the scan refutes the prediction, or the pose that the
+//! search found, unless others around the prediction were compared and fit worse; and where others fit as well.
 //!
 //! Thresholds: [`tracking_loss`](crate::localization::tracking_loss), [`convergence`](crate::localization::convergence),
 //! and for what is searched [`places`](crate::localization::places).

@@ -2,11 +2,9 @@
 //! ([`proposal`](crate::localization::proposal)).
 
 use rand::Rng;
-use rayon::prelude::*;
 
 use super::phase::Phase;
-use super::reweight::Update;
-use super::search::{APART_M, PLACE_BEAMS, within_place};
+use super::reweight::{Others, Update};
 use super::state::{ParticleFilter, attitude_above};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
@@ -15,7 +13,7 @@ use crate::localization::observation::{
 };
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
-use crate::localization::places::{best_of_each, is_same};
+use crate::localization::places::is_same;
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::{GroundPatch, SensorAttitude};
 use crate::registration::{RegistrationConfig, approach, register_informative, registered_pose};
@@ -27,7 +25,7 @@ const MAX_SIGMAS: f64 = 6.0;
 
 /// Where a registration may lead.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Basin {
+pub(super) enum Basin {
     /// To a pose that the prediction allows, from a start or else from the prediction.
     Pose { start: Option<Pose3> },
     /// To any pose in the place, from the prediction and, if it is searched, from the best of many poses around it.
@@ -36,31 +34,17 @@ enum Basin {
 
 /// Distribution of the pose of a frame, given prediction and scan.
 pub(super) struct Posterior {
-    gaussian: Gaussian,
+    pub(super) gaussian: Gaussian,
     /// Beams that are compared with the map there.
-    beams: Vec<Beam>,
-    mean_cost_m: Option<f64>,
+    pub(super) beams: Vec<Beam>,
+    pub(super) mean_cost_m: Option<f64>,
     pub(super) attitude: SensorAttitude,
     /// Above which the attitude is.
     pub(super) ground: GroundPatch,
     /// Whether the registration refutes the prediction, or replaces one that no scan confirmed.
     pub(super) refutes: bool,
-    /// Poses in the place, the registered one among them, that fit as well, if it was searched.
-    alike: Vec<Pose3>,
-}
-
-/// What a search around the prediction shows of the pose to which a scan led.
-pub(super) enum Searched {
-    /// No other pose fits as well.
-    Best,
-    /// Others fit as well.
-    Alike,
-    /// Another one fits better: the sensor moved otherwise than predicted.
-    Elsewhere {
-        posterior: Box<Posterior>,
-        /// Whether no other pose fits as well as that one.
-        is_best: bool,
-    },
+    /// Poses that were found in the place and fit alike, with their costs [m], beginning with that from which the scan was registered.
+    pub(super) alike: Vec<(Pose3, f64)>,
 }
 
 impl ParticleFilter {
@@ -124,55 +108,8 @@ impl ParticleFilter {
         self.propose_in(scan, attitude, place, rng)
     }
 
-    /// Searches the surroundings of the prediction for poses that fit as well as one in space to which a scan led, or better, by the mean
-    /// costs of the same beams.
-    pub(super) fn search_around(
-        &self,
-        scan: &RangeImage,
-        attitude: (&SensorAttitude, Option<Pose3>),
-        here: &Pose3,
-        rng: &mut impl Rng,
-    ) -> Result<Searched, RenderError> {
-        /// Distance from which on a pose is another one: its position is wrong if the first one is right [m].
-        const OTHER_M: f64 = 0.5;
-        let place = Basin::Place { is_searched: true };
-        let Some(found) = self.propose_in(scan, attitude, place, rng)? else {
-            return Ok(Searched::Best);
-        };
-        let are_apart =
-            |a: &Pose3, b: &Pose3| (a.translation.vector - b.translation.vector).norm() >= OTHER_M;
-        if !found.alike.iter().any(|pose| are_apart(pose, here)) {
-            return Ok(Searched::Best);
-        }
-        let there = found.ground.lift(&found.gaussian.mean, &found.attitude);
-        let (both, observation) = ([Some(*here), Some(there)], &self.config.observation);
-        let costs_m = costs_of_scan(
-            &*self.map.renderer,
-            &both,
-            (scan, &found.beams),
-            observation,
-        )?;
-        let [here_m, there_m] = [costs_m[0], costs_m[1]].map(|m| m.unwrap_or(f64::INFINITY));
-        let tolerance_m = self.config.places.tolerance_m;
-        Ok(
-            if there_m + tolerance_m < here_m && are_apart(&there, here) {
-                Searched::Elsewhere {
-                    is_best: !found.alike.iter().any(|pose| are_apart(pose, &there)),
-                    posterior: Box::new(Posterior {
-                        refutes: true,
-                        ..found
-                    }),
-                }
-            } else if there_m <= here_m + tolerance_m {
-                Searched::Alike
-            } else {
-                Searched::Best
-            },
-        )
-    }
-
     /// Registers the scan in a basin, and fuses the result with the prediction.
-    fn propose_in(
+    pub(super) fn propose_in(
         &self,
         scan: &RangeImage,
         (attitude, in_space): (&SensorAttitude, Option<Pose3>),
@@ -208,8 +145,8 @@ impl ParticleFilter {
                     let above = (&patch, attitude);
                     starts.extend(self.starts_around(&mean, (scan, &returns), above, rng)?);
                 }
-                alike = self.best_registered(&starts, &mean, scan, (&registered, &beams))?;
-                alike.first().copied()
+                alike = self.best_in_place(&starts, &mean, scan, (&registered, &beams))?;
+                alike.first().map(|&(pose, _)| pose)
             }
         };
         let start = match start {
@@ -292,7 +229,7 @@ impl ParticleFilter {
             ground: Some(posterior.ground),
             pose,
             refutes: posterior.refutes,
-            is_best: false,
+            others: Others::Unknown,
         }
     }
 }
@@ -300,7 +237,6 @@ impl ParticleFilter {
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
-    use glam::Vec3;
     use nalgebra::Vector3;
     use rand::{SeedableRng as _, rngs::StdRng};
 
@@ -389,17 +325,6 @@ mod tests {
         assert!(error_m(truth, 0.1, off) < 0.01);
     }
 
-    /// A pose beside a house without a car or a pole, its scan, and the part of the scan that looks alike along the wall.
-    fn beside_a_wall(world: &TestWorld) -> (Pose2, [RangeImage; 2]) {
-        let pose = world.pose_at(22.0, 0.2, 0.05);
-        let whole = world.scan(&pose);
-        let is_of_wall = |point: &Vec3| point.y < 0.0 && point.x.abs() < 1.0;
-        let ranges_m = (whole.points.iter().zip(&whole.ranges))
-            .map(|(point, &range_m)| if is_of_wall(point) { range_m } else { 0.0 });
-        let of_wall = RangeImage::from_ranges(ranges_m.collect(), &whole.model);
-        (pose, [whole, of_wall])
-    }
-
     #[test]
     fn a_registration_that_refutes_the_prediction_replaces_it_where_no_other_pose_fits_as_well() {
         let world = TestWorld::street();
@@ -446,132 +371,6 @@ mod tests {
             ..*beam
         });
         assert!(!refutes(0.6, 0.0, &shortened.collect::<Vec<_>>()));
-    }
-
-    /// The other pose to which a search leads, if there is one.
-    fn other(searched: Searched) -> Option<Pose2> {
-        match searched {
-            Searched::Elsewhere { posterior, .. } => Some(posterior.gaussian.mean),
-            Searched::Best | Searched::Alike => None,
-        }
-    }
-
-    #[test]
-    fn a_scan_that_fits_much_better_next_to_a_tracked_pose_is_used_there() {
-        let world = TestWorld::street();
-        let truth = world.pose_at(12.0, 0.2, 0.05);
-        let scan = world.scan(&truth);
-        let attitude = SensorAttitude::default();
-        for (off_m, turned_rad) in [(0.0, 0.0), (0.8, 0.0), (-0.8, 0.0), (2.5, 0.0), (2.0, 0.3)] {
-            let pose = truth * Pose2::new(nalgebra::Vector2::new(off_m, 0.0), turned_rad);
-            let prior = Gaussian::new(pose, nalgebra::Matrix3::identity() * 1e-4).unwrap();
-            let mut rng = StdRng::seed_from_u64(1);
-            let mut filter = tracking(&world, &prior, &mut rng);
-            let lifted = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
-            let found = filter.search_around(&scan, (&attitude, None), &lifted, &mut rng);
-            let found = other(found.unwrap());
-            assert_eq!(found.is_some(), off_m != 0.0, "{off_m}");
-            if let Some(found) = found {
-                assert_relative_eq!(found, truth, epsilon = 5e-3);
-            }
-            // A registration with a narrow kernel does not lead there.
-            filter.config.proposal.registration.kernel_m = 0.02;
-            filter
-                .agreement
-                .observe(Some(0.98), &filter.config.tracking_loss);
-            let frame = filter
-                .step(Odometry::Unknown, &scan, &attitude, &mut rng)
-                .unwrap();
-            assert_relative_eq!(frame.pose, truth, epsilon = 5e-3);
-            // No other pose fits as well.
-            assert_eq!(frame.state, State::Tracking, "{off_m}");
-            assert_eq!(filter.updated.refuted, off_m != 0.0, "{off_m}");
-        }
-    }
-
-    #[test]
-    fn after_an_assumed_motion_a_frame_is_tracked_where_no_other_pose_fits_as_well() {
-        let world = TestWorld::street();
-        let (truth, [whole, of_wall]) = beside_a_wall(&world);
-        let attitude = SensorAttitude::default();
-        let stands = Pose3::identity();
-        for (scan, odometry, is_confirmed) in [
-            (&whole, Odometry::Motion(stands), true),
-            (&whole, Odometry::Assumed(stands), true),
-            (&of_wall, Odometry::Motion(stands), true),
-            (&of_wall, Odometry::Assumed(stands), false),
-        ] {
-            let prior = Gaussian::new(truth, nalgebra::Matrix3::identity() * 1e-4).unwrap();
-            let mut rng = StdRng::seed_from_u64(1);
-            let mut filter = tracking(&world, &prior, &mut rng);
-            let frame = filter.step(odometry, scan, &attitude, &mut rng).unwrap();
-            let is_tracking = frame.state == State::Tracking;
-            assert_eq!(is_tracking, is_confirmed, "{odometry:?}");
-            assert_eq!(filter.updated.refuted, !is_confirmed, "{odometry:?}");
-        }
-    }
-
-    #[test]
-    fn a_search_around_the_prediction_is_the_same_on_any_number_of_threads() {
-        let world = TestWorld::street();
-        let truth = world.pose_at(12.0, 0.2, 0.05);
-        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
-        let pose = truth * Pose2::translation(2.5, 0.0);
-        let prior = Gaussian::new(pose, nalgebra::Matrix3::identity() * 1e-4).unwrap();
-        let found = [1, 4].map(|threads| {
-            let mut rng = StdRng::seed_from_u64(1);
-            let filter = tracking(&world, &prior, &mut rng);
-            let lifted = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-            let found = pool
-                .unwrap()
-                .install(|| filter.search_around(&scan, (&attitude, None), &lifted, &mut rng));
-            other(found.unwrap())
-        });
-        assert!(found[0].is_some() && found[0] == found[1]);
-    }
-
-    #[test]
-    fn a_pose_elsewhere_with_which_too_few_beams_agree_is_confirmed_by_the_next_scan() {
-        let world = TestWorld::street();
-        let truth = world.pose_at(12.0, 0.2, 0.05);
-        let attitude = SensorAttitude::default();
-        let whole = world.scan(&truth);
-        let ranges_m = (whole.ranges.iter().enumerate())
-            .map(|(pixel, range_m)| range_m * if pixel % 3 == 0 { 0.9 } else { 1.0 });
-        let shortened = RangeImage::from_ranges(ranges_m.collect(), &whole.model);
-        let pose = truth * Pose2::translation(2.0, 0.0);
-        let prior = Gaussian::new(pose, nalgebra::Matrix3::identity() * 1e-4).unwrap();
-        let mut rng = StdRng::seed_from_u64(1);
-        let mut filter = tracking(&world, &prior, &mut rng);
-        filter.config.proposal.registration.kernel_m = 0.02;
-        let stands = Odometry::Assumed(Pose3::identity());
-        for (scan, state) in [(&shortened, State::Searching), (&whole, State::Tracking)] {
-            let frame = filter.step(stands, scan, &attitude, &mut rng).unwrap();
-            assert_relative_eq!(frame.pose, truth, epsilon = 0.01);
-            assert_eq!(frame.state, state, "{:?}", frame.agreement);
-        }
-    }
-
-    #[test]
-    fn a_right_pose_with_which_fewer_beams_agree_than_usual_stays() {
-        let world = TestWorld::street();
-        let truth = world.pose_at(12.0, 0.2, 0.05);
-        let scan = world.scan(&truth);
-        let ranges_m = (scan.ranges.iter().enumerate())
-            .map(|(pixel, range_m)| range_m * if pixel % 4 == 0 { 0.9 } else { 1.0 });
-        let scan = RangeImage::from_ranges(ranges_m.collect(), &scan.model);
-        let prior = Gaussian::new(truth, nalgebra::Matrix3::identity() * 1e-4).unwrap();
-        let mut rng = StdRng::seed_from_u64(1);
-        let mut filter = tracking(&world, &prior, &mut rng);
-        let config = filter.config.tracking_loss.clone();
-        filter.agreement.observe(Some(0.98), &config);
-        let attitude = SensorAttitude::default();
-        let frame = filter.step(Odometry::Unknown, &scan, &attitude, &mut rng);
-        let frame = frame.unwrap();
-        assert!(frame.agreement < Some(0.9), "{:?}", frame.agreement);
-        assert_relative_eq!(frame.pose, truth, epsilon = 0.01);
-        assert!(!filter.updated.refuted);
     }
 
     #[test]

@@ -26,14 +26,29 @@ pub(super) struct Update {
     pub(super) pose: Option<Pose2>,
     /// Whether the scan shows that the prediction is wrong, or replaces one that no scan confirmed.
     pub(super) refutes: bool,
-    /// Whether a search around the prediction found no other pose that fits as well.
-    pub(super) is_best: bool,
+    /// How other poses around the prediction fit.
+    pub(super) others: Others,
+}
+
+/// How other poses around a prediction fit a scan, compared with the pose of an update.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Others {
+    /// None were compared.
+    Unknown,
+    /// None fits as well.
+    Worse,
+    /// Some fit as well.
+    Alike,
 }
 
 impl Update {
     /// Whether the next scan has to confirm the pose.
     pub fn needs_confirmation(&self) -> bool {
-        self.refutes && !self.is_best
+        match self.others {
+            Others::Unknown => self.refutes,
+            Others::Worse => false,
+            Others::Alike => true,
+        }
     }
 }
 
@@ -91,7 +106,7 @@ impl ParticleFilter {
                     ground: None,
                     pose: None,
                     refutes: false,
-                    is_best: false,
+                    others: Others::Unknown,
                 });
             }
             self.resample(rng);
@@ -161,6 +176,7 @@ impl ParticleFilter {
             covariance,
             is_narrow,
             refuted: update.refutes,
+            is_doubtful: update.refutes || update.others == Others::Alike,
         };
         Ok(estimate)
     }

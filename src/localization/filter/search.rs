@@ -8,6 +8,7 @@ use rand::Rng;
 use rayon::prelude::*;
 
 use super::phase::Search;
+use super::reweight::Others;
 use super::reweight::Update;
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
@@ -103,7 +104,7 @@ impl ParticleFilter {
             ground: Some(places[best].patch),
             pose: Some(*places[best].pose()),
             refutes: false,
-            is_best: false,
+            others: Others::Unknown,
         }))
     }
 

@@ -51,8 +51,10 @@ pub(super) struct Updated {
     pub covariance: Matrix3<f64>,
     /// Whether the distribution around it was narrow.
     pub is_narrow: bool,
-    /// Whether its scan refuted the prediction, or replaced one that no scan confirmed: the next one has to confirm it.
+    /// Whether its scan refuted the prediction, or replaced one that no scan confirmed.
     pub refuted: bool,
+    /// The same, or whether other poses around the prediction fit as well: those around the next one are compared, too.
+    pub is_doubtful: bool,
 }
 
 /// Motion since the last update.
@@ -96,6 +98,7 @@ impl Updated {
             covariance: particles.covariance_about(&pose),
             is_narrow: false,
             refuted: false,
+            is_doubtful: false,
         }
     }
 }

@@ -6,8 +6,7 @@ use nalgebra::Matrix3;
 use rand::Rng;
 
 use super::phase::{Evidence, Phase, Search};
-use super::propose::Searched;
-use super::reweight::{Compared, Update};
+use super::reweight::{Compared, Others, Update};
 use super::state::{ParticleFilter, Pending};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, PERIOD_S, RangeImage};
@@ -54,27 +53,27 @@ impl ParticleFilter {
         let mut compared = self.compared(&update)?;
         let config = &self.config.tracking_loss;
         let is_suspect = matches!(odometry, Odometry::Assumed(_))
-            || self.updated.refuted
+            || self.updated.is_doubtful
             || update.refutes
             || (self.agreement).suggests_another_pose(compared.agreement, config);
         if let Some(predicted) = predicted.filter(|_| is_suspect) {
             let updated = mem::replace(&mut self.particles, predicted);
             let here = compared.in_space.map_from_lidar;
-            match self.search_around(scan, (attitude, self.predicted), &here, rng)? {
-                Searched::Best => {
-                    self.particles = updated;
-                    update.is_best = true;
-                }
-                Searched::Alike => {
-                    self.particles = updated;
-                    update.refutes = true;
-                }
-                Searched::Elsewhere { posterior, is_best } => {
-                    update = self.sample(*posterior, rng);
+            let (better, others) =
+                self.search_around(scan, (attitude, self.predicted), &here, rng)?;
+            let is_sure = match better {
+                Some(posterior) => {
+                    update = self.sample(posterior, rng);
                     compared = self.compared(&update)?;
-                    let sure_agreement = self.config.tracking_loss.sure_agreement;
-                    update.is_best = is_best && compared.agreement >= Some(sure_agreement);
+                    compared.agreement >= Some(self.config.tracking_loss.sure_agreement)
                 }
+                None => {
+                    self.particles = updated;
+                    true
+                }
+            };
+            if is_sure || others == Others::Alike {
+                update.others = others;
             }
         }
         let mut estimate = self.updated_estimate(&update, compared)?;
@@ -157,7 +156,7 @@ impl ParticleFilter {
         })
     }
 
-    /// Without measured odometry every scan is used: nothing else shows whether the car moves. So is one after a refuted prediction.
+    /// Without measured odometry every scan is used: nothing else shows whether the car moves. So is one after a doubtful pose.
     fn is_update_due(&self, odometry: Odometry) -> bool {
         let is_due = |pending: &Pending| {
             pending.motion.translation.vector.norm() > self.config.move_thres_m
@@ -165,7 +164,7 @@ impl ParticleFilter {
                 || self.is_less_certain(pending, odometry)
         };
         let is_assumed = matches!(odometry, Odometry::Unknown | Odometry::Assumed(_));
-        is_assumed || self.updated.refuted || self.pending.as_ref().is_none_or(is_due)
+        is_assumed || self.updated.is_doubtful || self.pending.as_ref().is_none_or(is_due)
     }
 
     /// Whether a pose that is tracked and registered is less certain, by the motion since the last update, than that left it.
@@ -256,9 +255,14 @@ impl ParticleFilter {
         Ok(agreement(&beams, &rendered_m, tolerance_m))
     }
 
-    /// What an update shows, of which the averages of the agreement are kept. A pose that replaces the prediction is not
-    /// confirmed by its own scan, and restarts the count.
-    fn evidence(&mut self, estimate: &Estimate, odometry: Odometry, refutes: bool) -> Evidence {
+    /// What an update shows, of which the averages of the agreement are kept. A pose that the next scan has to confirm restarts the
+    /// count.
+    fn evidence(
+        &mut self,
+        estimate: &Estimate,
+        odometry: Odometry,
+        needs_confirmation: bool,
+    ) -> Evidence {
         let config = &self.config.tracking_loss;
         let agreement = estimate.agreement;
         // Without a known motion the next frame cannot be predicted.
@@ -272,9 +276,11 @@ impl ParticleFilter {
         Evidence {
             disagrees: self.agreement.is_lost(config),
             is_scattered: spread(&covariance).0 > config.max_spread_m,
-            is_confirmed: self
-                .agreement
-                .confirm(is_converged && !refutes, agreement, config),
+            is_confirmed: self.agreement.confirm(
+                is_converged && !needs_confirmation,
+                agreement,
+                config,
+            ),
             are_alike: agreement >= Some(config.min_agreement) && self.compares_places(),
             is_precise: self.is_precise(&estimate.covariance),
             is_twice_as_precise: self.is_precise(&(estimate.covariance * 4.0)),

@@ -288,7 +288,7 @@ impl Run {
         Ok(())
     }
 
-    /// Calls all frames lost, with a warning, if their scans are distorted in more of them than a pose was tracked in.
+    /// Marks all frames as lost, with a warning, if their scans are distorted in more of them than a pose was tracked in.
     pub fn refuse_distorted(&mut self) {
         let states = self.results.states.iter().flatten();
         let tracking = states.filter(|&&state| state == State::Tracking as u8);
