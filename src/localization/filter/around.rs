@@ -221,6 +221,40 @@ mod tests {
     }
 
     #[test]
+    fn a_pose_that_is_turned_or_a_little_off_is_replaced() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        for (off_m, turned_rad) in [(0.3, 0.0), (0.0, 0.3)] {
+            let pose = truth * Pose2::new(nalgebra::Vector2::new(off_m, 0.0), turned_rad);
+            let mut rng = StdRng::seed_from_u64(1);
+            let filter = tracking(&world, &pose, &mut rng);
+            let here = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
+            let found = filter.search_around(&scan, (&attitude, None), &here, &mut rng);
+            let (better, others) = found.unwrap();
+            assert_relative_eq!(better.unwrap().gaussian.mean, truth, epsilon = 5e-3);
+            assert_eq!(others, Others::Worse);
+        }
+    }
+
+    #[test]
+    fn a_search_of_another_place_tells_nothing_of_a_pose() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        for (away_m, expected) in [(0.0, Others::Worse), (20.0, Others::Unknown)] {
+            let mut rng = StdRng::seed_from_u64(1);
+            let elsewhere = truth * Pose2::translation(away_m, 0.0);
+            let filter = tracking(&world, &elsewhere, &mut rng);
+            let here = filter.lift(&truth, &attitude, None).unwrap().map_from_lidar;
+            let found = filter.search_around(&scan, (&attitude, None), &here, &mut rng);
+            let (better, others) = found.unwrap();
+            assert!(better.is_none());
+            assert_eq!(others, expected);
+        }
+    }
+
+    #[test]
     fn a_search_around_the_prediction_is_the_same_on_any_number_of_threads() {
         let world = TestWorld::street();
         let truth = world.pose_at(12.0, 0.2, 0.05);

@@ -86,7 +86,7 @@ pub(super) struct Evidence {
 }
 
 impl Evidence {
-    /// The same where the scan refutes the prediction: how wide the distribution is says nothing.
+    /// The same for a pose that the next scan has to confirm: how wide the distribution is says nothing.
     pub fn refuted(self) -> Self {
         Self {
             is_precise: false,

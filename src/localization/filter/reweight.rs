@@ -33,7 +33,7 @@ pub(super) struct Update {
 /// How other poses around a prediction fit a scan, compared with the pose of an update.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Others {
-    /// None were compared.
+    /// Not known: none were compared, or not around this pose, or too few beams agree with it.
     Unknown,
     /// None fits as well.
     Worse,

@@ -53,7 +53,7 @@ pub(super) struct Updated {
     pub is_narrow: bool,
     /// Whether its scan refuted the prediction, or replaced one that no scan confirmed.
     pub refuted: bool,
-    /// The same, or whether other poses around the prediction fit as well: those around the next one are compared, too.
+    /// Whether it is refuted, or others fit as well: those around the next prediction are compared, too.
     pub is_doubtful: bool,
 }
 
