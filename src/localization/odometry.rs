@@ -19,7 +19,7 @@ pub enum Odometry {
     Increment(Pose2),
     /// Measured in space, such as by the odometry of the scans; roll and pitch follow it too.
     Motion(Pose3),
-    /// The same, but assumed in some direction: a motion that the scans do not determine, or only after a surprise.
+    /// In space as well, but predicted, doubtful, or not determined in some direction by the scans.
     Assumed(Pose3),
     /// Commanded: velocities held since the previous frame.
     Velocity(VelocityCommand),

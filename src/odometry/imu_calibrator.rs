@@ -91,8 +91,7 @@ pub(super) fn measured_turn(
     step: &OdometryEstimate,
     (from_s, to_s): (f64, f64),
 ) -> Option<MeasuredTurn> {
-    let is_known = step.is_determined();
-    is_known.then_some(MeasuredTurn {
+    step.is_determined().then_some(MeasuredTurn {
         from_s,
         to_s,
         turn: step.previous_from_current.rotation,

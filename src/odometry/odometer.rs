@@ -194,7 +194,7 @@ fn advance(
 }
 
 impl OdometryEstimate {
-    /// Whether the scan determines the motion to it in all directions, and without a surprise.
+    /// Whether the scan determines the motion to it in all directions, and is not [doubtful](StepState::Doubtful).
     pub fn is_determined(&self) -> bool {
         self.state == StepState::Registered && self.degenerate_directions.is_empty()
     }

@@ -43,11 +43,8 @@ impl ParticleFilter {
         let least_m = (found.alike.iter()).fold(f64::INFINITY, |least, (_, m)| least.min(*m));
         let tolerance_m = self.config.places.tolerance_m;
         let is_better = least_m + tolerance_m < here_m;
-        let (best, most_m) = if is_better {
-            (found.alike[0].0, f64::INFINITY)
-        } else {
-            (*here, here_m + tolerance_m)
-        };
+        let best = if is_better { found.alike[0].0 } else { *here };
+        let most_m = least_m.min(here_m) + tolerance_m;
         let is_other = |(pose, cost_m): &(Pose3, f64)| {
             let apart_m = (pose.translation.vector - best.translation.vector).norm();
             apart_m >= OTHER_M && *cost_m <= most_m
@@ -140,20 +137,16 @@ mod tests {
     use nalgebra::{Matrix3, Vector3};
     use rand::{SeedableRng, rngs::StdRng};
 
-    use super::super::phase::Phase;
+    use super::super::propose;
     use super::*;
+    use crate::localization::State;
     use crate::localization::odometry::Odometry;
-    use crate::localization::{LocalizerConfig, ParticleSet, State};
     use crate::map::world_for_tests::TestWorld;
 
     /// A filter that tracks a pose, with a standard deviation of a centimetre and of half a degree.
     fn tracking(world: &TestWorld, pose: &Pose2, rng: &mut StdRng) -> ParticleFilter {
         let prior = Gaussian::new(*pose, Matrix3::identity() * 1e-4).unwrap();
-        let particles = ParticleSet::uniform(prior.sample(100, rng));
-        let config = LocalizerConfig::of_test(100);
-        let mut filter = ParticleFilter::new(config, world.map(), None, particles).unwrap();
-        filter.phase = Phase::Tracking;
-        filter
+        propose::tests::tracking(world, &prior, rng)
     }
 
     /// A pose next to a house without a car or a pole, its scan, and the part of the scan that looks alike along the wall.

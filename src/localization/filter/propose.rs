@@ -235,7 +235,7 @@ impl ParticleFilter {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use approx::assert_relative_eq;
     use nalgebra::Vector3;
     use rand::{SeedableRng as _, rngs::StdRng};
@@ -246,7 +246,7 @@ mod tests {
     use crate::map::world_for_tests::TestWorld;
 
     /// A filter that tracks, with particles of a distribution.
-    fn tracking(world: &TestWorld, prior: &Gaussian, rng: &mut StdRng) -> ParticleFilter {
+    pub fn tracking(world: &TestWorld, prior: &Gaussian, rng: &mut StdRng) -> ParticleFilter {
         let particles = ParticleSet::uniform(prior.sample(100, rng));
         let config = LocalizerConfig::of_test(100);
         let mut filter = ParticleFilter::new(config, world.map(), None, particles).unwrap();

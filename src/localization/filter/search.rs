@@ -8,8 +8,7 @@ use rand::Rng;
 use rayon::prelude::*;
 
 use super::phase::Search;
-use super::reweight::Others;
-use super::reweight::Update;
+use super::reweight::{Others, Update};
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};

@@ -195,7 +195,7 @@ impl FrameLocalizer<'_> {
         let motion = (given.or_else(|| of_scans.in_space().map(FrameMotion::from_motion)))
             .or_else(|| self.motion.given_over(since..row + 1));
         let times_s = [before_s, frame.time_s];
-        // The models of the motion are those of measured ones.
+        // A motion model has the noise of measured motions.
         let odometry = match (given, of_scans) {
             (None, Odometry::Assumed(_)) => of_scans,
             _ => odometry_into(self.opened.config.motion_model, motion, times_s),
