@@ -5,6 +5,9 @@ use smart_default::SmartDefault;
 
 use crate::validation::{InvalidValue, Validate, at_least_one, in_range, positive};
 
+/// Largest acceleration of a sensor [m/s²]: five times that of gravity, for a sensor in the hand.
+pub(crate) const MAX_ACCELERATION_M_PER_S2: f64 = 50.0;
+
 /// Settings of the odometry. Lengths are shares of the sensor's range, which 98 % of the points do not exceed.
 ///
 /// Defaults: our own values.
@@ -42,7 +45,7 @@ pub struct OdometryConfig {
     pub first_motion_share: f64,
     /// Largest acceleration of the sensor [m/s²]: five times that of gravity, for a sensor in the hand. A motion that deviates
     /// more from the prediction is refused once, and taken where the next scan fits as well.
-    #[default(50.0)]
+    #[default(MAX_ACCELERATION_M_PER_S2)]
     pub max_acceleration_m_per_s2: f64,
     /// The same of its turns [deg/s²]: 20 degrees within 0.1 s.
     #[default(2000.0)]

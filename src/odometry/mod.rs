@@ -66,6 +66,7 @@ pub use pose_check::{MotionDifference, PoseCheck, PoseFit, PoseMeaning};
 pub use timing::TimingError;
 pub use trajectory::{InertialEstimate, Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
+pub(crate) use config::MAX_ACCELERATION_M_PER_S2;
 pub(crate) use pose_check::{GivenPoses, check_poses};
 pub(crate) use timing::{TimingComparison, compare_timings, fits_best};
 

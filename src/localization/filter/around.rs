@@ -8,16 +8,17 @@ use super::reweight::Others;
 use super::search::{APART_M, PLACE_BEAMS, within_place};
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::lidar::{Beam, RangeImage};
+use crate::lidar::{Beam, PERIOD_S, RangeImage};
 use crate::localization::observation::{ClassifiedReturns, costs_of_scan};
 use crate::localization::places::{best_of_each, is_same};
 use crate::localization::proposal::Gaussian;
 use crate::map::{GroundPatch, SensorAttitude};
+use crate::odometry::MAX_ACCELERATION_M_PER_S2;
 use crate::rendering::RenderError;
 
 impl ParticleFilter {
     /// Compares the pose in space to which a scan led with others around the prediction, by the mean costs of the same beams. Returns
-    /// the distribution around a better one, if there is one, and how others fit.
+    /// the distribution around a better one, if there is one that the sensor can have reached, and how others fit.
     pub(super) fn search_around(
         &self,
         scan: &RangeImage,
@@ -43,6 +44,9 @@ impl ParticleFilter {
         let least_m = (found.alike.iter()).fold(f64::INFINITY, |least, (_, m)| least.min(*m));
         let tolerance_m = self.config.places.tolerance_m;
         let is_better = least_m + tolerance_m < here_m;
+        if is_better && found.refutes && !self.is_reachable(&found.gaussian.mean) {
+            return Ok((None, Others::Alike));
+        }
         let best = if is_better { found.alike[0].0 } else { *here };
         let most_m = least_m.min(here_m) + tolerance_m;
         let is_other = |(pose, cost_m): &(Pose3, f64)| {
@@ -62,6 +66,17 @@ impl ParticleFilter {
             ..found
         });
         Ok((better, others))
+    }
+
+    /// Whether a sensor that moved at constant velocity until its pose was last certain can have accelerated to a pose since.
+    fn is_reachable(&self, pose: &Pose2) -> bool {
+        let shift_m = pose.translation.vector - self.particles.mean().translation.vector;
+        shift_m.norm() <= MAX_ACCELERATION_M_PER_S2 * self.since_certain_s().powi(2)
+    }
+
+    /// Time since the pose was last not doubtful, at least that of a scan [s].
+    pub(super) fn since_certain_s(&self) -> f64 {
+        self.updated.doubtful_s.unwrap_or(0.0) + self.duration_s.max(PERIOD_S)
     }
 
     /// Poses in the place of a pose with which a scan is most consistent, at least a metre apart, each at the height and the attitude of the
@@ -170,6 +185,7 @@ mod tests {
             let pose = truth * Pose2::new(nalgebra::Vector2::new(off_m, 0.0), turned_rad);
             let mut rng = StdRng::seed_from_u64(1);
             let mut filter = tracking(&world, &pose, &mut rng);
+            filter.set_duration_s(0.3);
             let lifted = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
             let found = filter.search_around(&scan, (&attitude, None), &lifted, &mut rng);
             let found = found.unwrap().0.map(|found| found.gaussian.mean);
@@ -193,6 +209,61 @@ mod tests {
     }
 
     #[test]
+    fn a_better_pose_is_used_once_the_sensor_can_have_reached_it() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        // 0.5 m within a tenth of a second, and nine times that within three.
+        for (off_m, periods, is_used) in [
+            (0.4, 1.0, true),
+            (0.6, 1.0, false),
+            (0.6, 2.0, true),
+            (2.5, 2.0, false),
+            (2.5, 3.0, true),
+        ] {
+            let pose = truth * Pose2::translation(off_m, 0.0);
+            // Since the last scan, or in scans each of which was doubtful.
+            for doubtful_s in [None, Some(PERIOD_S * (periods - 1.0))] {
+                let mut rng = StdRng::seed_from_u64(1);
+                let mut filter = tracking(&world, &pose, &mut rng);
+                filter.updated.doubtful_s = doubtful_s;
+                if doubtful_s.is_none() {
+                    filter.set_duration_s(periods * PERIOD_S);
+                }
+                let here = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
+                let found = filter.search_around(&scan, (&attitude, None), &here, &mut rng);
+                let (better, others) = found.unwrap();
+                assert_eq!(better.is_some(), is_used, "{off_m} {periods}");
+                let expected = if is_used {
+                    Others::Worse
+                } else {
+                    Others::Alike
+                };
+                assert_eq!(others, expected, "{off_m} {periods}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_tracked_pose_next_to_the_right_one_is_searched_until_that_can_be_reached() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        let mut rng = StdRng::seed_from_u64(1);
+        let pose = truth * Pose2::translation(1.5, 0.0);
+        let mut filter = tracking(&world, &pose, &mut rng);
+        filter.config.proposal.registration.kernel_m = 0.02;
+        let stands = Odometry::Assumed(Pose3::identity());
+        let states = [State::Searching, State::Searching, State::Tracking];
+        for (state, off_m) in states.into_iter().zip([1.5, 0.0, 0.0]) {
+            let frame = filter.step(stands, &scan, &attitude, &mut rng).unwrap();
+            let found_m = (frame.pose.translation.vector - truth.translation.vector).norm();
+            assert_relative_eq!(found_m, off_m, epsilon = 0.05);
+            assert_eq!(frame.state, state, "{off_m}");
+        }
+    }
+
+    #[test]
     fn after_an_assumed_motion_a_frame_is_tracked_where_no_other_pose_fits_as_well() {
         let world = TestWorld::street();
         let (truth, [whole, of_wall]) = next_to_a_wall(&world);
@@ -209,8 +280,26 @@ mod tests {
             let frame = filter.step(odometry, scan, &attitude, &mut rng).unwrap();
             let is_tracking = frame.state == State::Tracking;
             assert_eq!(is_tracking, is_confirmed, "{odometry:?}");
-            assert_eq!(filter.updated.is_doubtful, !is_confirmed, "{odometry:?}");
+            let is_doubtful = filter.updated.doubtful_s.is_some();
+            assert_eq!(is_doubtful, !is_confirmed, "{odometry:?}");
         }
+    }
+
+    #[test]
+    fn a_pose_of_which_others_fitted_alike_is_tracked_after_two_scans_with_which_none_does() {
+        let world = TestWorld::street();
+        let (truth, [whole, of_wall]) = next_to_a_wall(&world);
+        let attitude = SensorAttitude::default();
+        let stands = Odometry::Assumed(Pose3::identity());
+        let mut rng = StdRng::seed_from_u64(1);
+        let mut filter = tracking(&world, &truth, &mut rng);
+        let scans = [&of_wall, &of_wall, &whole, &whole, &whole];
+        let states = scans.map(|scan| {
+            let frame = filter.step(stands, scan, &attitude, &mut rng);
+            frame.unwrap().state
+        });
+        let is_tracking = states.map(|state| state == State::Tracking);
+        assert_eq!(is_tracking, [false, false, false, true, true]);
     }
 
     #[test]
@@ -255,7 +344,8 @@ mod tests {
         let pose = truth * Pose2::translation(2.5, 0.0);
         let found = [1, 4].map(|threads| {
             let mut rng = StdRng::seed_from_u64(1);
-            let filter = tracking(&world, &pose, &mut rng);
+            let mut filter = tracking(&world, &pose, &mut rng);
+            filter.set_duration_s(0.3);
             let lifted = filter.lift(&pose, &attitude, None).unwrap().map_from_lidar;
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
             let found = pool
@@ -278,6 +368,7 @@ mod tests {
         let pose = truth * Pose2::translation(2.0, 0.0);
         let mut rng = StdRng::seed_from_u64(1);
         let mut filter = tracking(&world, &pose, &mut rng);
+        filter.set_duration_s(0.3);
         filter.config.proposal.registration.kernel_m = 0.02;
         let stands = Odometry::Assumed(Pose3::identity());
         for (scan, state) in [(&shortened, State::Searching), (&whole, State::Tracking)] {

@@ -32,7 +32,8 @@ fn tracking(config: LocalizerConfig, pose: Pose2, covariance: Matrix3<f64>) -> P
         covariance,
         is_narrow: true,
         refuted: false,
-        is_doubtful: false,
+        is_one_of_several: false,
+        doubtful_s: None,
     };
     filter
 }

@@ -26,8 +26,8 @@
 //! Without panoramas the filter stays `Lost` until a pose is confirmed. What is reported, see [`Phase::reported`]:
 //!
 //! ```text
-//! Searching  searching          Tracking  tracking; searching while the position is not precise, nothing is compared, or much less
-//!                                         than usual agrees
+//! Searching  searching          Tracking  tracking; searching while the position is not precise, nothing is compared, much less
+//!                                         than usual agrees, or other poses fitted alike in the scan before
 //! Uncertain  searching          Lost      lost
 //! ```
 

@@ -171,12 +171,15 @@ impl ParticleFilter {
         if update.refutes && self.updated.refuted && !self.phase.is_tracking() {
             self.last_motion = None;
         }
+        let is_one_of_several = update.others == Others::Alike;
+        let is_doubtful = update.refutes || is_one_of_several;
         self.updated = Updated {
             pose,
             covariance,
             is_narrow,
             refuted: update.refutes,
-            is_doubtful: update.refutes || update.others == Others::Alike,
+            is_one_of_several,
+            doubtful_s: is_doubtful.then(|| self.since_certain_s()),
         };
         Ok(estimate)
     }

@@ -53,8 +53,11 @@ pub(super) struct Updated {
     pub is_narrow: bool,
     /// Whether its scan refuted the prediction, or replaced one that no scan confirmed.
     pub refuted: bool,
-    /// Whether it is refuted, or others fit as well: those around the next prediction are compared, too.
-    pub is_doubtful: bool,
+    /// Whether others around the prediction fitted alike.
+    pub is_one_of_several: bool,
+    /// How long the poses have been doubtful [s]: refuted, or others fit as well, so that those around the next prediction are
+    /// compared, too. `None` where this one is not.
+    pub doubtful_s: Option<f64>,
 }
 
 /// Motion since the last update.
@@ -98,7 +101,8 @@ impl Updated {
             covariance: particles.covariance_about(&pose),
             is_narrow: false,
             refuted: false,
-            is_doubtful: false,
+            is_one_of_several: false,
+            doubtful_s: None,
         }
     }
 }

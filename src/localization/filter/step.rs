@@ -51,9 +51,10 @@ impl ParticleFilter {
             None => self.reweight_widely(scan, attitude, rng)?,
         };
         let mut compared = self.compared(&update)?;
+        let was_one_of_several = self.updated.is_one_of_several;
         let config = &self.config.tracking_loss;
         let is_suspect = matches!(odometry, Odometry::Assumed(_))
-            || self.updated.is_doubtful
+            || self.updated.doubtful_s.is_some()
             || update.refutes
             || (self.agreement).suggests_another_pose(compared.agreement, config);
         if let Some(predicted) = predicted.filter(|_| is_suspect) {
@@ -107,7 +108,9 @@ impl ParticleFilter {
         estimate.places = self.likely_places();
         let is_doubtful =
             earlier_agreement.is_doubtful(estimate.agreement, &self.config.tracking_loss);
-        let is_sure = evidence.is_precise && estimate.agreement.is_some() && !is_doubtful;
+        let is_sure = evidence.is_precise
+            && estimate.agreement.is_some()
+            && !(is_doubtful || was_one_of_several);
         estimate.state = self.phase.reported(is_sure);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
@@ -164,7 +167,7 @@ impl ParticleFilter {
                 || self.is_less_certain(pending, odometry)
         };
         let is_assumed = matches!(odometry, Odometry::Unknown | Odometry::Assumed(_));
-        is_assumed || self.updated.is_doubtful || self.pending.as_ref().is_none_or(is_due)
+        is_assumed || self.updated.doubtful_s.is_some() || self.pending.as_ref().is_none_or(is_due)
     }
 
     /// Whether a pose that is tracked and registered is less certain, by the motion since the last update, than that left it.
