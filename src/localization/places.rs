@@ -50,6 +50,13 @@ pub struct PlacesConfig {
     pub given_up_weight: f64,
 }
 
+impl PlacesConfig {
+    /// Excess of the cost above the least with which a place is given up that weighed as much before [m].
+    pub(crate) fn excess_given_up_m(&self) -> f64 {
+        self.tolerance_m - self.scale_m * self.given_up_weight.ln()
+    }
+}
+
 impl Validate for PlacesConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("most", self.most, 1..=1000)?;

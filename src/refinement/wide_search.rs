@@ -22,7 +22,7 @@ use super::upright::{UprightSurfaces, is_upright_height};
 use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3};
 use crate::lidar::Beam;
 use crate::random::stream;
-use crate::registration::{RegistrationConfig, register_coarse_to_fine};
+use crate::registration::{RegistrationConfig, approach_widely, registered_pose};
 use crate::rendering::RenderError;
 use crate::validation::{InvalidValue, Validate, in_range, nested, positive};
 
@@ -161,15 +161,9 @@ pub(super) fn finish(
     };
     let some: Vec<Beam> = objective.beams.iter().step_by(STEP).copied().collect();
     let lifted = patch.lift(pose, &objective.attitude);
-    let registered = register_coarse_to_fine(
-        objective.renderer,
-        [&some, objective.beams],
-        &lifted,
-        config.kernel_m,
-        gauss_newton,
-        |_| true,
-    )?;
-    let found = registered.map_or(lifted, |registered| registered.map_from_lidar);
+    let renderer = objective.renderer;
+    let near = approach_widely(renderer, &some, &lifted, config.kernel_m, gauss_newton)?;
+    let found = registered_pose(renderer, objective.beams, &near, gauss_newton)?.unwrap_or(near);
     let is_near = (pose2_from_pose3(&found).translation.vector - pose.translation.vector).norm()
         < reach_m.max(1.0);
     let found = if is_near { found } else { lifted };

@@ -135,32 +135,31 @@ pub(crate) fn measured_range_factor(
     Ok(range_factor::range_factor(&residuals, beams, wide.kernel()))
 }
 
-/// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second
-/// as configured. Beams that do not determine the pose are passed over, and a pose that is not accepted ends it; the last accepted
-/// one is returned, if any.
-pub(crate) fn register_coarse_to_fine(
+/// Registers beams, starting at `initial`; `None` if they do not determine the pose.
+pub(crate) fn register(
     renderer: &dyn RangeRenderer,
-    beams: [&[Beam]; 2],
+    beams: &[Beam],
     initial: &Pose3,
-    wide_kernel_m: f64,
     config: &RegistrationConfig,
-    is_accepted: impl Fn(&Pose3) -> bool,
 ) -> Result<Option<RegistrationResult>, RenderError> {
+    let found = Linearized::new(renderer, beams, initial, config)?.descend()?;
+    found.map_or(Ok(None), Descent::result)
+}
+
+/// The pose of beams that are registered with a kernel of `kernel_m` from farther away, from which a registration as configured goes
+/// on; `initial` if they do not determine it.
+pub(crate) fn approach_widely(
+    renderer: &dyn RangeRenderer,
+    beams: &[Beam],
+    initial: &Pose3,
+    kernel_m: f64,
+    config: &RegistrationConfig,
+) -> Result<Pose3, RenderError> {
     let wide = config
         .with_tolerance(COARSE_TOLERANCE_M)
-        .with_kernel(wide_kernel_m);
-    let (mut pose, mut accepted) = (*initial, None);
-    for (beams, config) in beams.into_iter().zip([&wide, config]) {
-        let Some(found) = Linearized::new(renderer, beams, &pose, config)?.descend()? else {
-            continue;
-        };
-        if !is_accepted(&found.map_from_lidar) {
-            break;
-        }
-        pose = found.map_from_lidar;
-        accepted = Some(found);
-    }
-    accepted.map_or(Ok(None), Descent::result)
+        .with_kernel(kernel_m);
+    let near = registered_pose(renderer, beams, initial, &wide)?;
+    Ok(near.unwrap_or(*initial))
 }
 
 /// Beams with their residuals at a pose near the right one: it can be improved, or kept.

@@ -1,7 +1,6 @@
 //! Search around a prediction: whether other poses fit as well as that to which a registration led, or better.
 
 use rand::Rng;
-use rayon::prelude::*;
 
 use super::propose::{Basin, Posterior};
 use super::reweight::Others;
@@ -92,9 +91,9 @@ impl ParticleFilter {
         /// tenth of a radian.
         const POSES: usize = 2000;
         /// Number of beams of each comparison.
-        const BEAMS: usize = 100;
+        const BEAMS: usize = 200;
         /// Largest number of poses that are returned.
-        const STARTS: usize = 8;
+        const STARTS: usize = 16;
         let beams = returns.choose(BEAMS, self.config.proposal.road_share, rng);
         let radius_m = self.config.places.radius_m;
         let covariance = within_place(None, radius_m);
@@ -108,8 +107,7 @@ impl ParticleFilter {
             Some(patch.shifted(&shift_m).lift(pose, attitude))
         };
         let lifted: Vec<Option<Pose3>> = poses.iter().map(lift).collect();
-        let observation = &self.config.observation;
-        let costs_m = costs_of_scan(&*self.map.renderer, &lifted, (scan, &beams), observation)?;
+        let costs_m = self.least_costs(&lifted, (scan, &beams))?;
         let best = best_of_each(&poses, &costs_m, STARTS, APART_M);
         Ok(best.into_iter().filter_map(|index| lifted[index]).collect())
     }
@@ -125,9 +123,9 @@ impl ParticleFilter {
     ) -> Result<Vec<(Pose3, f64)>, RenderError> {
         let step = registered.len().div_ceil(PLACE_BEAMS).max(1);
         let some: Vec<Beam> = registered.iter().step_by(step).copied().collect();
-        let register = |start| self.registered_in_place(&some, start, place);
-        let found: Result<Vec<_>, RenderError> = starts.par_iter().map(register).collect();
-        let found = found?.into_iter().flatten();
+        let starts: Vec<_> = starts.iter().map(|start| (*start, *place)).collect();
+        let found = self.registered_in_places(&starts, scan, &some)?;
+        let found = found.into_iter().flatten();
         let poses: Vec<_> = found.map(|found| Some(found.map_from_lidar)).collect();
         let observation = &self.config.observation;
         let costs_m = costs_of_scan(&*self.map.renderer, &poses, (scan, compared), observation)?;

@@ -201,7 +201,7 @@ impl ParticleFilter {
     }
 
     /// Aligns the particles to the ground of the map and returns their poses in space.
-    fn align_to_ground(
+    pub(super) fn align_to_ground(
         &mut self,
         attitude: &SensorAttitude,
     ) -> Result<Vec<Option<Pose3>>, RenderError> {

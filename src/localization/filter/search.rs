@@ -17,7 +17,7 @@ use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::{best_of_each, is_same, weights_after, weights_in};
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::{GroundPatch, SensorAttitude};
-use crate::registration::{RegistrationResult, register_coarse_to_fine};
+use crate::registration::{RegistrationResult, approach_widely, register};
 use crate::rendering::RenderError;
 
 /// Number of beams that are registered at a place.
@@ -118,7 +118,12 @@ impl ParticleFilter {
         let observation = &self.config.observation;
         let count = observation.beams_for(self.particles.len());
         let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
-        let (_, costs_m) = self.log_likelihoods((scan, &beams), attitude)?;
+        let costs_m = if self.is_first_search() {
+            let poses = self.align_to_ground(attitude)?;
+            self.least_costs(&poses, (scan, &beams))?
+        } else {
+            self.log_likelihoods((scan, &beams), attitude)?.1
+        };
         let config = &self.config.places;
         let best = [config.radius_m, APART_M]
             .map(|radius_m| best_of_each(self.particles.poses(), &costs_m, config.most, radius_m));
@@ -126,28 +131,83 @@ impl ParticleFilter {
         Ok(unique.into_iter().collect())
     }
 
-    /// Registers [`PLACE_BEAMS`] beams at a pose in a place, half of them with a wide kernel first; `None` where that fails or leads
-    /// out of the place.
-    pub(super) fn registered_in_place(
+    /// Whether no places have been registered yet.
+    fn is_first_search(&self) -> bool {
+        !matches!(self.phase.search(), Some(Search::Places { .. }))
+    }
+
+    /// Mean costs of poses [m]; `None` off the map, and where the first comparison, with few of the beams, is worse than that of most
+    /// poses.
+    pub(super) fn least_costs(
         &self,
+        poses: &[Option<Pose3>],
+        (scan, beams): (&RangeImage, &[Beam]),
+    ) -> Result<Vec<Option<f64>>, RenderError> {
+        /// Share of the beams of the first comparison, and of the poses that are left by it: one in so many.
+        const PART: usize = 4;
+        let costs = |poses: &[Option<Pose3>], beams: &[Beam]| {
+            let observation = &self.config.observation;
+            costs_of_scan(&*self.map.renderer, poses, (scan, beams), observation)
+        };
+        let some: Vec<Beam> = beams.iter().step_by(PART).copied().collect();
+        let first_m = costs(poses, &some)?;
+        let mut ascending_m: Vec<f64> = first_m.iter().flatten().copied().collect();
+        ascending_m.sort_by(f64::total_cmp);
+        // As many as the particles that track one pose stay in any case.
+        let left = (ascending_m.len() / PART).max(self.config.num_reduced);
+        let most_m = ascending_m.get(left).copied().unwrap_or(f64::INFINITY);
+        let is_left = |cost_m: &Option<f64>| cost_m.is_some_and(|cost_m| cost_m <= most_m);
+        let left: Vec<Option<Pose3>> = (poses.iter().zip(&first_m))
+            .map(|(pose, cost_m)| pose.filter(|_| is_left(cost_m)))
+            .collect();
+        costs(&left, beams)
+    }
+
+    /// Registers [`PLACE_BEAMS`] beams at poses, each in its place, half of them with a wide kernel first, and all of them where that fits
+    /// about as well as at the best pose. `None` elsewhere, and where registration fails or leads out of the place.
+    pub(super) fn registered_in_places(
+        &self,
+        starts: &[(Pose3, Pose2)],
+        scan: &RangeImage,
         beams: &[Beam],
-        start: &Pose3,
-        place: &Pose2,
-    ) -> Result<Option<RegistrationResult>, RenderError> {
+    ) -> Result<Vec<Option<RegistrationResult>>, RenderError> {
         /// Scale of the robust kernel for particles that are a metre off [m].
         const WIDE_KERNEL_M: f64 = 0.4;
         /// Tolerance [m]: the noise of 800 beams is millimetres, and the next scan goes on from there.
         const TOLERANCE_M: f64 = 5e-3;
+        /// Largest excess of the cost with which the registration goes on, in those that give a place up: once for its cost, once for its
+        /// weight before.
+        const EXCESS: f64 = 2.0;
+        let renderer = &*self.map.renderer;
         let registration = self.config.proposal.registration.cautious();
+        let registration = registration.with_tolerance(TOLERANCE_M);
+        let places = &self.config.places;
+        let is_in =
+            |place: &Pose2, pose: &Pose3| is_same(place, &pose2_from_pose3(pose), places.radius_m);
         let half: Vec<Beam> = beams.iter().step_by(2).copied().collect();
-        register_coarse_to_fine(
-            &*self.map.renderer,
-            [&half, beams],
-            start,
-            WIDE_KERNEL_M,
-            &registration.with_tolerance(TOLERANCE_M),
-            |pose| is_same(place, &pose2_from_pose3(pose), self.config.places.radius_m),
-        )
+        let approach = |(start, place): &(Pose3, Pose2)| {
+            let near = approach_widely(renderer, &half, start, WIDE_KERNEL_M, &registration)?;
+            Ok(Some(near).filter(|near| is_in(place, near)))
+        };
+        let near: Result<Vec<Option<Pose3>>, RenderError> =
+            starts.par_iter().map(approach).collect();
+        let near = near?;
+        let observation = &self.config.observation;
+        let costs_m = costs_of_scan(renderer, &near, (scan, beams), observation)?;
+        let least_m = (costs_m.iter().flatten()).fold(f64::INFINITY, |least, m| least.min(*m));
+        let most_m = least_m + EXCESS * places.excess_given_up_m();
+        let register =
+            |((near, cost_m), (_, place)): ((&Option<Pose3>, &Option<f64>), &(_, Pose2))| {
+                let Some(near) = near.filter(|_| cost_m.is_none_or(|cost_m| cost_m <= most_m))
+                else {
+                    return Ok(None);
+                };
+                let found = register(renderer, beams, &near, &registration)?;
+                Ok(found.filter(|found| is_in(place, &found.map_from_lidar)))
+            };
+        (near.par_iter().zip(&costs_m).zip(starts))
+            .map(register)
+            .collect()
     }
 
     /// Registers the scan at particles.
@@ -160,28 +220,30 @@ impl ParticleFilter {
     ) -> Result<Vec<PlaceHypothesis>, RenderError> {
         let road_share = self.config.proposal.road_share;
         let beams = choose_beams(scan, PLACE_BEAMS, road_share, attitude, rng);
-        let radius_m = self.config.places.radius_m;
-        let place = |&seed: &usize| {
+        let (mut starts, mut patches) = (Vec::new(), Vec::new());
+        for &seed in seeds {
             let particle = &self.particles.particles()[seed];
-            let Some(patch) = ground_patch_of(particle, &self.map, None)? else {
-                return Ok(None);
-            };
-            let start = particle.map_from_lidar;
-            let lifted = patch.lift(&start, attitude);
-            let found = self.registered_in_place(&beams, &lifted, &start)?;
-            let covariance = (found.as_ref()).map(RegistrationResult::planar_covariance);
-            let pose = found.map_or(lifted, |found| found.map_from_lidar);
-            let mean = pose2_from_pose3(&pose);
-            Ok(within_place(covariance, radius_m)
-                .and_then(|covariance| Gaussian::new(mean, covariance))
-                .map(|distribution| PlaceHypothesis {
-                    map_from_lidar: pose,
-                    distribution,
+            if let Some(patch) = ground_patch_of(particle, &self.map, None)? {
+                let place = particle.map_from_lidar;
+                starts.push((patch.lift(&place, attitude), place));
+                patches.push(patch);
+            }
+        }
+        let found = self.registered_in_places(&starts, scan, &beams)?;
+        let place =
+            |((found, (lifted, _)), patch): ((Option<RegistrationResult>, &(Pose3, _)), _)| {
+                let covariance = (found.as_ref()).map(RegistrationResult::planar_covariance);
+                let map_from_lidar = found.map_or(*lifted, |found| found.map_from_lidar);
+                let mean = pose2_from_pose3(&map_from_lidar);
+                let covariance = within_place(covariance, self.config.places.radius_m)?;
+                Some(PlaceHypothesis {
+                    map_from_lidar,
+                    distribution: Gaussian::new(mean, covariance)?,
                     patch,
-                }))
-        };
-        let places: Result<Vec<_>, RenderError> = seeds.par_iter().map(place).collect();
-        Ok(places?.into_iter().flatten().collect())
+                })
+            };
+        let all = found.into_iter().zip(&starts).zip(patches);
+        Ok(all.filter_map(place).collect())
     }
 
     fn costs_of_places(
@@ -202,8 +264,7 @@ impl ParticleFilter {
     fn weights_before(&self, places: &[&PlaceHypothesis], radius_m: f64) -> Vec<f64> {
         let poses: Vec<Pose2> = places.iter().map(|place| *place.pose()).collect();
         let weights = weights_in(&poses, self.particles.particles(), radius_m);
-        let is_first = !matches!(self.phase.search(), Some(Search::Places { .. }));
-        if is_first || weights.iter().sum::<f64>() <= 0.0 {
+        if self.is_first_search() || weights.iter().sum::<f64>() <= 0.0 {
             return vec![1.0; places.len()];
         }
         weights
@@ -247,4 +308,63 @@ pub(super) fn within_place(
     };
     let information = regular(&registered).try_inverse()? + place.try_inverse()?;
     information.try_inverse()
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{SeedableRng as _, rngs::StdRng};
+
+    use super::super::propose::tests::tracking;
+    use super::*;
+    use crate::map::world_for_tests::TestWorld;
+
+    #[test]
+    fn the_particles_that_are_left_by_few_beams_have_the_costs_of_all_and_the_best_is_among_them() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        let mut rng = StdRng::seed_from_u64(1);
+        let widely = Matrix3::from_diagonal(&Vector3::new(4.0, 4.0, 0.04));
+        let prior = Gaussian::new(truth, widely).unwrap();
+        let mut filter = tracking(&world, &prior, &mut rng);
+        filter.config.num_reduced = 10;
+        let beams = choose_beams(&scan, 100, 0.2, &attitude, &mut rng);
+        let (_, all_m) = filter.log_likelihoods((&scan, &beams), &attitude).unwrap();
+        let poses = filter.align_to_ground(&attitude).unwrap();
+        let left_m = filter.least_costs(&poses, (&scan, &beams)).unwrap();
+        assert_eq!(left_m.len(), 100);
+        let count = left_m.iter().flatten().count();
+        assert!((25..30).contains(&count), "{count}");
+        let is_as_of_all = |(left, all): (&Option<f64>, _)| left.is_none() || left == all;
+        assert!(left_m.iter().zip(&all_m).all(is_as_of_all));
+        let least_m = |costs_m: &[Option<f64>]| {
+            let known = costs_m.iter().flatten();
+            known.fold(f64::INFINITY, |least, m| least.min(*m))
+        };
+        assert_eq!(least_m(&left_m), least_m(&all_m));
+    }
+
+    #[test]
+    fn a_scan_is_not_registered_in_a_place_that_fits_much_worse_than_another() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        let mut rng = StdRng::seed_from_u64(1);
+        let prior = Gaussian::new(truth, Matrix3::identity() * 1e-4).unwrap();
+        let mut filter = tracking(&world, &prior, &mut rng);
+        let beams = choose_beams(&scan, PLACE_BEAMS, 0.2, &attitude, &mut rng);
+        let starts = [0.5, 12.0].map(|ahead_m| {
+            let place = truth * Pose2::translation(ahead_m, 0.0);
+            let lifted = filter.lift(&place, &attitude, None).unwrap();
+            (lifted.map_from_lidar, place)
+        });
+        for (given_up_weight, expected) in [(1e-6, [true, false]), (0.0, [true, true])] {
+            filter.config.places.given_up_weight = given_up_weight;
+            let found = filter.registered_in_places(&starts, &scan, &beams).unwrap();
+            let is_found = [0, 1].map(|index| found[index].is_some());
+            assert_eq!(is_found, expected, "{given_up_weight}");
+            let pose = pose2_from_pose3(&found[0].as_ref().unwrap().map_from_lidar);
+            assert!((pose.inverse() * truth).translation.vector.norm() < 0.01);
+        }
+    }
 }
