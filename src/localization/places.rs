@@ -45,13 +45,14 @@ pub struct PlacesConfig {
     #[default(0.01)]
     pub likely_weight: f64,
     /// Weight below which a place is given up, 0 to 1. All of the 40 places that are registered in a frame weigh less than
-    /// 0.00004 together then: the probability that the right one is given up, as far as the weights are right.
+    /// 0.00004 together then: the probability that the right one is given up, as far as the weights are right. A scan is registered
+    /// further at a pose where its coarse cost exceeds the least by at most twice what this weight allows.
     #[default(1e-6)]
     pub given_up_weight: f64,
 }
 
 impl PlacesConfig {
-    /// Excess of the cost above the least with which a place is given up that weighed as much before [m].
+    /// Excess of its cost above the least at which a place of equal weight is given up [m].
     pub(crate) fn excess_given_up_m(&self) -> f64 {
         self.tolerance_m - self.scale_m * self.given_up_weight.ln()
     }

@@ -43,7 +43,8 @@ impl ParticleFilter {
         let least_m = (found.alike.iter()).fold(f64::INFINITY, |least, (_, m)| least.min(*m));
         let tolerance_m = self.config.places.tolerance_m;
         let is_better = least_m + tolerance_m < here_m;
-        if is_better && found.refutes && !self.is_reachable(&found.gaussian.mean) {
+        let predicted = self.particles.mean();
+        if is_better && found.refutes && !self.is_reachable(&predicted, &found.gaussian.mean) {
             return Ok((None, Others::Alike));
         }
         let best = if is_better { found.alike[0].0 } else { *here };
@@ -55,7 +56,7 @@ impl ParticleFilter {
         let radius_m = self.config.places.radius_m;
         let others = if found.alike.iter().any(is_other) {
             Others::Alike
-        } else if is_same(&self.particles.mean(), &pose2_from_pose3(&best), radius_m) {
+        } else if is_same(&predicted, &pose2_from_pose3(&best), radius_m) {
             Others::Worse
         } else {
             Others::Unknown
@@ -67,15 +68,15 @@ impl ParticleFilter {
         Ok((better, others))
     }
 
-    /// Whether a sensor that moved at constant velocity until its pose was last certain can have accelerated to a pose since.
-    fn is_reachable(&self, pose: &Pose2) -> bool {
-        let shift_m = pose.translation.vector - self.particles.mean().translation.vector;
+    /// Whether a sensor whose pose was predicted can have accelerated to another pose since it was last certain.
+    pub(super) fn is_reachable(&self, predicted: &Pose2, pose: &Pose2) -> bool {
+        let shift_m = pose.translation.vector - predicted.translation.vector;
         shift_m.norm() <= MAX_ACCELERATION_M_PER_S2 * self.since_certain_s().powi(2)
     }
 
     /// Time since the pose was last not doubtful, at least that of a scan [s].
     pub(super) fn since_certain_s(&self) -> f64 {
-        self.updated.doubtful_s.unwrap_or(0.0) + self.duration_s.max(PERIOD_S)
+        (self.updated.doubtful_s.unwrap_or(0.0) + self.duration_s).max(PERIOD_S)
     }
 
     /// Poses in the place of a pose with which a scan is most consistent, at least a metre apart, each at the height and the attitude of the
@@ -238,6 +239,42 @@ mod tests {
                     Others::Alike
                 };
                 assert_eq!(others, expected, "{off_m} {periods}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_time_since_a_pose_was_certain_is_that_of_the_scans_and_at_least_a_tenth_of_a_second() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let mut rng = StdRng::seed_from_u64(1);
+        let mut filter = tracking(&world, &truth, &mut rng);
+        for (doubtful_s, duration_s, since_s) in [
+            (None, 0.02, 0.1),
+            (None, 0.5, 0.5),
+            (Some(0.06), 0.02, 0.1),
+            (Some(0.3), 0.1, 0.4),
+        ] {
+            filter.updated.doubtful_s = doubtful_s;
+            filter.set_duration_s(duration_s);
+            assert_relative_eq!(filter.since_certain_s(), since_s, epsilon = 1e-12);
+        }
+    }
+
+    #[test]
+    fn a_registration_that_leads_farther_than_the_sensor_can_have_is_confirmed_by_the_next_scan() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.2, 0.05);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
+        for (off_m, state) in [(0.4, State::Tracking), (0.8, State::Searching)] {
+            let mut rng = StdRng::seed_from_u64(1);
+            let pose = truth * Pose2::translation(0.0, off_m);
+            let mut filter = tracking(&world, &pose, &mut rng);
+            let stands = Odometry::Motion(Pose3::identity());
+            for state in [state, State::Tracking] {
+                let frame = filter.step(stands, &scan, &attitude, &mut rng).unwrap();
+                assert_relative_eq!(frame.pose, truth, epsilon = 5e-3);
+                assert_eq!(frame.state, state, "{off_m}");
             }
         }
     }

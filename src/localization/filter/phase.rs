@@ -142,7 +142,7 @@ impl Phase {
     }
 
     /// The state of a frame; `is_sure`: its position is precise, which the odometry changes between updates, its scan was
-    /// compared with the map, and their agreement is not doubtful.
+    /// compared with the map, their agreement is not doubtful, and no others fitted alike in the scan before.
     pub fn reported(self, is_sure: bool) -> State {
         match self {
             Self::Tracking if is_sure => State::Tracking,

@@ -143,7 +143,7 @@ impl ParticleFilter {
         poses: &[Option<Pose3>],
         (scan, beams): (&RangeImage, &[Beam]),
     ) -> Result<Vec<Option<f64>>, RenderError> {
-        /// Share of the beams of the first comparison, and of the poses that are left by it: one in so many.
+        /// Divisor of the number of beams in the first comparison, and of the number of poses that stay after it.
         const PART: usize = 4;
         let costs = |poses: &[Option<Pose3>], beams: &[Beam]| {
             let observation = &self.config.observation;
@@ -154,8 +154,8 @@ impl ParticleFilter {
         let mut ascending_m: Vec<f64> = first_m.iter().flatten().copied().collect();
         ascending_m.sort_by(f64::total_cmp);
         // As many as the particles that track one pose stay in any case.
-        let left = (ascending_m.len() / PART).max(self.config.num_reduced);
-        let most_m = ascending_m.get(left).copied().unwrap_or(f64::INFINITY);
+        let count = (ascending_m.len() / PART).max(self.config.num_reduced);
+        let most_m = ascending_m.get(count).copied().unwrap_or(f64::INFINITY);
         let is_left = |cost_m: &Option<f64>| cost_m.is_some_and(|cost_m| cost_m <= most_m);
         let left: Vec<Option<Pose3>> = (poses.iter().zip(&first_m))
             .map(|(pose, cost_m)| pose.filter(|_| is_left(cost_m)))
@@ -175,9 +175,9 @@ impl ParticleFilter {
         const WIDE_KERNEL_M: f64 = 0.4;
         /// Tolerance [m]: the noise of 800 beams is millimetres, and the next scan goes on from there.
         const TOLERANCE_M: f64 = 5e-3;
-        /// Largest excess of the cost with which the registration goes on, in those that give a place up: once for its cost, once for its
-        /// weight before.
-        const EXCESS: f64 = 2.0;
+        /// Factor on the excess at which a place is given up, up to which the registration goes on: a place may have had a larger weight by
+        /// as much.
+        const EXCESS_FACTOR: f64 = 2.0;
         let renderer = &*self.map.renderer;
         let registration = self.config.proposal.registration.cautious();
         let registration = registration.with_tolerance(TOLERANCE_M);
@@ -195,7 +195,7 @@ impl ParticleFilter {
         let observation = &self.config.observation;
         let costs_m = costs_of_scan(renderer, &near, (scan, beams), observation)?;
         let least_m = (costs_m.iter().flatten()).fold(f64::INFINITY, |least, m| least.min(*m));
-        let most_m = least_m + EXCESS * places.excess_given_up_m();
+        let most_m = least_m + EXCESS_FACTOR * places.excess_given_up_m();
         let register =
             |((near, cost_m), (_, place)): ((&Option<Pose3>, &Option<f64>), &(_, Pose2))| {
                 let Some(near) = near.filter(|_| cost_m.is_none_or(|cost_m| cost_m <= most_m))

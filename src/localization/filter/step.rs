@@ -58,6 +58,7 @@ impl ParticleFilter {
             || update.refutes
             || (self.agreement).suggests_another_pose(compared.agreement, config);
         if let Some(predicted) = predicted.filter(|_| is_suspect) {
+            let predicted_mean = predicted.mean();
             let updated = mem::replace(&mut self.particles, predicted);
             let here = compared.in_space.map_from_lidar;
             let (better, others) =
@@ -70,7 +71,8 @@ impl ParticleFilter {
                 }
                 None => {
                     self.particles = updated;
-                    true
+                    let there = update.pose.unwrap_or_else(|| self.particles.mean());
+                    !update.refutes || self.is_reachable(&predicted_mean, &there)
                 }
             };
             if is_sure || others == Others::Alike {
