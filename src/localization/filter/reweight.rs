@@ -37,7 +37,7 @@ pub(super) enum Others {
     Unknown,
     /// None fits as well.
     Worse,
-    /// Some fit as well.
+    /// Some fit as well, or better, but the sensor cannot have reached them.
     Alike,
 }
 
