@@ -37,7 +37,7 @@ pub(super) enum Others {
     Unknown,
     /// None fits as well.
     Worse,
-    /// Some fit as well, or better, but the sensor cannot have reached them.
+    /// Some fit as well, or one fits better that the sensor cannot have reached.
     Alike,
 }
 
