@@ -100,6 +100,7 @@ impl Part {
         }
         for _ in 0..iterations {
             let means = self.neighbor_means();
+            let before = self.mesh.vertices.clone();
             for vertex in (0..originals.len()).filter(|&v| self.kinds[v] == VertexKind::Interior) {
                 let position = self.mesh.vertices[vertex];
                 let normal = self.mesh.normals[vertex];
@@ -108,6 +109,7 @@ impl Part {
                 self.mesh.vertices[vertex] = originals[vertex]
                     + displacement.clamp(-MAX_DISPLACEMENT_M, MAX_DISPLACEMENT_M) * normal;
             }
+            undo_flips(&mut self.mesh, &before);
         }
     }
 
@@ -264,5 +266,26 @@ fn vertex_kind(edges: &[(u32, u32)]) -> VertexKind {
         (true, true) if reached >= 3 => VertexKind::Interior,
         (true, false) if reached >= 2 => VertexKind::Boundary,
         _ => VertexKind::Fixed,
+    }
+}
+
+/// Returns the vertices of triangles that faced up and do not any more to where they were before, until there are none.
+fn undo_flips(mesh: &mut TriangleMesh, before: &[Vec3]) {
+    let faces_up = |vertices: &[Vec3], triangle: &[u32; 3]| {
+        let [a, b, c] = triangle.map(|vertex| vertices[vertex as usize].truncate());
+        (b - a).perp_dot(c - a) > 0.0
+    };
+    loop {
+        let vertices = &mesh.vertices;
+        let is_flipped =
+            |triangle: &&[u32; 3]| faces_up(before, triangle) && !faces_up(vertices, triangle);
+        let triangles = mesh.triangles.par_iter();
+        let flipped: Vec<[u32; 3]> = triangles.filter(is_flipped).copied().collect();
+        if flipped.is_empty() {
+            return;
+        }
+        for vertex in flipped.into_iter().flatten() {
+            mesh.vertices[vertex as usize] = before[vertex as usize];
+        }
     }
 }
