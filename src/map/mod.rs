@@ -35,6 +35,7 @@ pub use tiles::cache::MapCache;
 pub use tiles::grid::{TileConfig, TileGrid, TileIndex};
 
 pub(crate) use build::cloud::CloudPlan;
+pub(crate) use ground::heights::LEVEL_GAP_M;
 pub(crate) use model::surface_of;
 pub(crate) use places::panorama::{PanoramaIndex, PanoramaRequest, PanoramaSeed};
 pub(crate) use unit::unit_doubt;

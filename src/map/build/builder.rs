@@ -300,6 +300,7 @@ impl MapPlan<'_> {
             gone.extend(built.gone);
         }
         gone.sort_unstable();
+        gone.dedup();
         Ok((mesh, gone))
     }
 

@@ -67,7 +67,7 @@ pub(crate) fn compare(
     };
     let is_owned = |triangle: u32| {
         let center = older.corners(triangle as usize).into_iter().sum::<DVec3>() / 3.0;
-        domain.ownership.owner_at(center.x, center.y) == domain.number
+        (domain.ownership).is_owner_at(domain.number, center.x, center.y)
     };
     let gone = (numbers.iter().zip(&crossed))
         .filter(|&(&triangle, &is_crossed)| is_crossed && is_owned(triangle))

@@ -188,6 +188,7 @@ impl Parts {
             gone.extend(part.gone);
         }
         gone.sort_unstable();
+        gone.dedup();
         Ok(Joined { meshes, gone })
     }
 
