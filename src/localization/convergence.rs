@@ -26,8 +26,8 @@ pub struct ConvergenceConfig {
     /// Number of occupied valid tiles below which the particles have converged.
     #[default(2)]
     pub converge_thres: usize,
-    /// Standard deviation of the position below which they have converged [m]; infinite for range-mcl's
-    /// condition alone.
+    /// Standard deviation of the position, and of the height of the ground below it, below which they have converged [m];
+    /// infinite for range-mcl's condition alone.
     #[default(0.5)]
     pub max_spread_m: f64,
     /// Standard deviation of the heading below which they have converged [rad].
@@ -55,7 +55,23 @@ pub fn occupied_tiles(particles: &ParticleSet, tiles: &TileGrid) -> usize {
 /// Whether the spread is small, whatever tiles the particles occupy.
 pub fn is_narrow(particles: &ParticleSet, config: &ConvergenceConfig) -> bool {
     let (position_m, heading_rad) = spread(&particles.covariance_about(&particles.mean()));
-    position_m < config.max_spread_m && heading_rad < config.max_spread_rad
+    position_m < config.max_spread_m
+        && heading_rad < config.max_spread_rad
+        && level_spread_m(particles) < config.max_spread_m
+}
+
+/// Standard deviation of the height of the ground below the particles, of those for which it is known [m].
+fn level_spread_m(particles: &ParticleSet) -> f64 {
+    let known = particles.particles().iter();
+    let known = known.filter_map(|it| Some((it.weight, it.level_m?)));
+    let [sum, first, second] = known.fold([0.0; 3], |sums, (weight, level_m)| {
+        let terms = [1.0, level_m, level_m.powi(2)];
+        [0, 1, 2].map(|power| sums[power] + weight * terms[power])
+    });
+    if sum <= 0.0 {
+        return 0.0;
+    }
+    (second / sum - (first / sum).powi(2)).max(0.0).sqrt()
 }
 
 /// Whether the particles have converged: a small number is sufficient.
@@ -70,6 +86,7 @@ mod tests {
 
     use super::*;
     use crate::geometry::{Pose2, Pose3};
+    use crate::localization::particles::Particle;
     use crate::map::TileConfig;
 
     fn tiles() -> TileGrid {
@@ -77,6 +94,21 @@ mod tests {
             .map(|i| Pose3::translation(f64::from(i), 0.0, 0.0))
             .collect();
         TileGrid::around(&poses, &TileConfig::default())
+    }
+
+    #[test]
+    fn particles_on_two_levels_of_a_car_park_have_not_converged() {
+        let config = ConvergenceConfig::default();
+        let on = |level_m: Option<f64>| Particle::new(Pose2::identity(), level_m);
+        for (levels_m, is_one) in [
+            ([Some(500.0), Some(500.2)], true),
+            ([Some(0.0), None], true),
+            ([None, None], true),
+            ([Some(0.0), Some(3.0)], false),
+        ] {
+            let particles = ParticleSet::uniform(levels_m.map(on));
+            assert_eq!(is_narrow(&particles, &config), is_one, "{levels_m:?}");
+        }
     }
 
     fn at(places: &[(f64, f64)]) -> ParticleSet {

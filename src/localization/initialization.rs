@@ -127,11 +127,13 @@ pub fn from_panoramas(
 
 /// The cells of least cost, one of each place.
 fn best_of_places(seeds: &[PanoramaSeed], config: &PlacesConfig) -> Vec<usize> {
-    let poses: Vec<Pose2> = (seeds.iter())
-        .map(|seed| Pose2::new(seed.center.coords, seed.heading_rad))
-        .collect();
+    let particle = |seed: &PanoramaSeed| {
+        let pose = Pose2::new(seed.center.coords, seed.heading_rad);
+        Particle::new(pose, Some(seed.level_m))
+    };
+    let particles: Vec<Particle> = seeds.iter().map(particle).collect();
     let costs_m: Vec<_> = seeds.iter().map(|seed| Some(seed.cost_m)).collect();
-    best_of_each(&poses, &costs_m, config.most, config.radius_m)
+    best_of_each(&particles, &costs_m, config.most, config.radius_m)
 }
 
 /// Samples a position in a square cell [m].

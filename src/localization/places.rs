@@ -17,6 +17,7 @@ use smart_default::SmartDefault;
 
 use super::particles::Particle;
 use crate::geometry::Pose2;
+use crate::map::LEVEL_GAP_M;
 use crate::validation::{InvalidValue, Validate, fraction, in_range, not_negative, positive};
 
 /// Search among several places.
@@ -79,14 +80,20 @@ pub fn is_same(a: &Pose2, b: &Pose2, radius_m: f64) -> bool {
         && between.rotation.angle().abs() < SAME_HEADING_RAD
 }
 
-/// Indices of the poses of least cost in each of at most `most` places; poses without a cost are left out.
+/// Whether two particles are in the same place, on the same level of the ground.
+fn is_same_level(a: &Particle, b: &Particle, radius_m: f64) -> bool {
+    let apart_m = a.level_m.zip(b.level_m).map_or(0.0, |(a, b)| (a - b).abs());
+    apart_m < LEVEL_GAP_M && is_same(&a.map_from_lidar, &b.map_from_lidar, radius_m)
+}
+
+/// Indices of the particles of least cost in each of at most `most` places; particles without a cost are left out.
 pub fn best_of_each<'a>(
-    poses: impl IntoIterator<Item = &'a Pose2>,
+    particles: impl IntoIterator<Item = &'a Particle>,
     costs_m: &[Option<f64>],
     most: usize,
     radius_m: f64,
 ) -> Vec<usize> {
-    let poses: Vec<&Pose2> = poses.into_iter().collect();
+    let particles: Vec<&Particle> = particles.into_iter().collect();
     let mut ascending: Vec<(f64, usize)> = (costs_m.iter().zip(0..))
         .filter_map(|(cost_m, index)| Some(((*cost_m)?, index)))
         .collect();
@@ -96,7 +103,8 @@ pub fn best_of_each<'a>(
         if chosen.len() == most {
             break;
         }
-        if !(chosen.iter()).any(|&other| is_same(poses[other], poses[index], radius_m)) {
+        let is_here = |&other: &usize| is_same_level(particles[other], particles[index], radius_m);
+        if !chosen.iter().any(is_here) {
             chosen.push(index);
         }
     }
@@ -104,10 +112,10 @@ pub fn best_of_each<'a>(
 }
 
 /// Weights of the particles in each place; a particle counts for the first place that it is in.
-pub fn weights_in(places: &[Pose2], particles: &[Particle], radius_m: f64) -> Vec<f64> {
+pub fn weights_in(places: &[Particle], particles: &[Particle], radius_m: f64) -> Vec<f64> {
     let mut weights = vec![0.0; places.len()];
     for particle in particles {
-        let is_here = |place: &Pose2| is_same(place, &particle.map_from_lidar, radius_m);
+        let is_here = |place: &Particle| is_same_level(place, particle, radius_m);
         if let Some(place) = places.iter().position(is_here) {
             weights[place] += particle.weight;
         }
@@ -158,9 +166,22 @@ mod tests {
             at(0.5, 3.0),
             at(900.0, 0.0),
         ];
+        let poses = poses.map(Particle::from);
         let costs_m = [Some(0.3), Some(0.1), Some(0.4), Some(0.2), None];
         assert_eq!(best_of_each(&poses, &costs_m, 9, 5.0), [1, 3, 2]);
         assert_eq!(best_of_each(&poses, &costs_m, 2, 5.0), [1, 3]);
+    }
+
+    #[test]
+    fn each_level_of_a_car_park_is_a_place_of_its_own() {
+        let on = |level_m: Option<f64>| Particle::new(at(0.0, 0.0), level_m);
+        let particles = [on(Some(0.0)), on(Some(3.0)), on(Some(0.5)), on(None)];
+        let costs_m = [Some(0.1), Some(0.2), Some(0.3), Some(0.4)];
+        assert_eq!(best_of_each(&particles, &costs_m, 9, 5.0), [0, 1]);
+        let places = &particles[..2];
+        let set = ParticleSet::weighted(particles.to_vec());
+        // That on no known level counts for the first place.
+        assert_eq!(weights_in(places, set.particles(), 5.0), [0.75, 0.25]);
     }
 
     #[test]
@@ -196,7 +217,7 @@ mod tests {
     fn a_particle_counts_for_one_place() {
         let set = ParticleSet::uniform([at(0.0, 0.0), at(4.0, 0.0), at(70.0, 0.0), at(200.0, 0.0)]);
         let weights = weights_in(
-            &[at(2.0, 0.0), at(5.0, 0.0), at(71.0, 0.0)],
+            &[at(2.0, 0.0), at(5.0, 0.0), at(71.0, 0.0)].map(Particle::from),
             set.particles(),
             5.0,
         );

@@ -9,6 +9,7 @@ use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, PERIOD_S, RangeImage};
 use crate::localization::observation::{ClassifiedReturns, costs_of_scan};
+use crate::localization::particles::Particle;
 use crate::localization::places::{best_of_each, is_same};
 use crate::localization::proposal::Gaussian;
 use crate::map::{GroundPatch, SensorAttitude};
@@ -109,7 +110,8 @@ impl ParticleFilter {
         };
         let lifted: Vec<Option<Pose3>> = poses.iter().map(lift).collect();
         let costs_m = self.least_costs(&lifted, (scan, &beams))?;
-        let best = best_of_each(&poses, &costs_m, STARTS, APART_M);
+        let particles: Vec<Particle> = poses.iter().copied().map(Particle::from).collect();
+        let best = best_of_each(&particles, &costs_m, STARTS, APART_M);
         Ok(best.into_iter().filter_map(|index| lifted[index]).collect())
     }
 

@@ -38,6 +38,11 @@ impl PlaceHypothesis {
     fn pose(&self) -> &Pose2 {
         &self.distribution.mean
     }
+
+    /// A particle at its pose, on its level.
+    fn particle(&self) -> Particle {
+        Particle::new(*self.pose(), Some(self.patch.height_m))
+    }
 }
 
 impl ParticleFilter {
@@ -73,9 +78,9 @@ impl ParticleFilter {
         );
         let beams = choose_beams(scan, count, road_share, attitude, rng);
         let costs_m = self.costs_of_places(&registered, (scan, &beams))?;
-        let poses = registered.iter().map(PlaceHypothesis::pose);
+        let particles: Vec<Particle> = registered.iter().map(PlaceHypothesis::particle).collect();
         let (places, costs_m): (Vec<&PlaceHypothesis>, Vec<f64>) =
-            (best_of_each(poses, &costs_m, config.most, config.radius_m).into_iter())
+            (best_of_each(&particles, &costs_m, config.most, config.radius_m).into_iter())
                 .filter_map(|index| Some((&registered[index], costs_m[index]?)))
                 .unzip();
         let before = self.weights_before(&places, config.radius_m);
@@ -125,8 +130,9 @@ impl ParticleFilter {
             self.log_likelihoods((scan, &beams), attitude)?.1
         };
         let config = &self.config.places;
-        let best = [config.radius_m, APART_M]
-            .map(|radius_m| best_of_each(self.particles.poses(), &costs_m, config.most, radius_m));
+        let best = [config.radius_m, APART_M].map(|radius_m| {
+            best_of_each(self.particles.particles(), &costs_m, config.most, radius_m)
+        });
         let unique: BTreeSet<usize> = best.into_iter().flatten().collect();
         Ok(unique.into_iter().collect())
     }
@@ -262,8 +268,8 @@ impl ParticleFilter {
     /// Weights of the places in the prediction. Those of the first scan are equal: the panoramas from which the
     /// particles were sampled have compared the same scan.
     fn weights_before(&self, places: &[&PlaceHypothesis], radius_m: f64) -> Vec<f64> {
-        let poses: Vec<Pose2> = places.iter().map(|place| *place.pose()).collect();
-        let weights = weights_in(&poses, self.particles.particles(), radius_m);
+        let at_poses: Vec<Particle> = places.iter().map(|place| place.particle()).collect();
+        let weights = weights_in(&at_poses, self.particles.particles(), radius_m);
         if self.is_first_search() || weights.iter().sum::<f64>() <= 0.0 {
             return vec![1.0; places.len()];
         }

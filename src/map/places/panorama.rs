@@ -32,6 +32,7 @@ use super::scan_panorama::{MOST_LIMIT_M, STEP_M, ScanPanorama, limit_of, thinned
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::map::ground::elevation::{GroundMap, SensorAttitude};
+use crate::map::ground::heights::LEVEL_GAP_M;
 use crate::map::tiles::grid::TileGrid;
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::raycasting::TileError;
@@ -321,7 +322,7 @@ impl PanoramaIndex {
         cells
     }
 
-    /// Keeps the first cells of a list, and the first one in each square: where little stands around the road, a
+    /// Keeps the first cells of a list, and the first one in each square on each level: where little stands around the road, a
     /// coarse panorama hardly shows which place is right.
     fn keep_best_and_one_per_square(&self, cells: &mut Vec<(f32, usize)>, best: usize) {
         const SQUARE_M: f64 = 5.0;
@@ -329,9 +330,14 @@ impl PanoramaIndex {
         let mut squares = BTreeSet::new();
         let mut rank = 0;
         cells.retain(|&(_, cell)| {
-            let square = [places[cell].x, places[cell].y].map(|m| (m / SQUARE_M).floor() as i64);
+            let place = &places[cell];
+            let square = [
+                place.x / SQUARE_M,
+                place.y / SQUARE_M,
+                place.level_m / LEVEL_GAP_M,
+            ];
             rank += 1;
-            squares.insert(square) || rank <= best
+            squares.insert(square.map(|along| along.floor() as i64)) || rank <= best
         });
     }
 }
