@@ -1,13 +1,15 @@
-//! Starts anywhere on the road of a map: success, time and memory.
+//! Starts anywhere on the road of a map, and the drive on from each: success, errors, time and memory.
 //!
 //! ```text
 //! cargo bench --bench starts -- MAP.ply RECORDING...      # recordings with poses in the frame of the map
-//! FPMCL_STARTS=50 cargo bench --bench starts -- MAP.ply RECORDING...
+//! FPMCL_STARTS=200 FPMCL_SCANS=20 cargo bench --bench starts -- MAP.ply RECORDING...
 //! ```
 //!
-//! Of each scan, a filter without an initial pose is started, and the estimate of its first frame compared with the
-//! pose of the recording. Prints the time to open the map, that of the first start, which makes or opens the panoramas,
-//! and of the others, the share that is within half a metre and a degree, and the memory of the process after each step.
+//! At `FPMCL_STARTS` (50) scans, evenly chosen, a filter without an initial pose is started, and driven on for
+//! `FPMCL_SCANS` (1) scans in all by the motion between the poses of the recording. Prints the time to open the map, that of
+//! the first start, which makes or opens the panoramas, and of the others, the share whose first estimate is within half a
+//! metre and a degree, the memory of the process after each step, and of all scans those that are called tracking: how many
+//! are more than half a metre off, and how many others are right but not called so.
 
 #![allow(clippy::print_stdout, reason = "the table")]
 
@@ -15,8 +17,8 @@ mod process;
 
 use std::time::Instant;
 
-use fpmcl::geometry::pose2_from_pose3;
-use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
+use fpmcl::geometry::{Pose2, Pose3, pose2_from_pose3};
+use fpmcl::localization::{Estimate, Localizer, LocalizerConfig, Odometry, Start, State};
 use fpmcl::map::{Map, MapCache, MapOptions};
 use fpmcl::recording::Recording;
 use fpmcl::sensor::{Sensor, SensorConfig};
@@ -28,7 +30,10 @@ fn main() -> Result<(), Failure> {
         println!("skipped: give a map and recordings with poses");
         return Ok(());
     };
-    let most: usize = std::env::var("FPMCL_STARTS").map_or(Ok(50), |text| text.parse())?;
+    let [most, scans_each] = [("FPMCL_STARTS", 50), ("FPMCL_SCANS", 1)].map(|(name, default)| {
+        std::env::var(name).map_or(Ok(default), |text| text.parse::<usize>())
+    });
+    let (most, scans_each) = (most?, scans_each?);
     let begin = Instant::now();
     let options = MapOptions {
         cache: MapCache::NextToMap,
@@ -54,6 +59,7 @@ fn main() -> Result<(), Failure> {
     }
     let step = scans.len().div_ceil(most).max(1);
     let (mut times_s, mut found, mut all) = (vec![], 0, 0);
+    let mut drives = Drives::default();
     let some = scans[..scans.len().min(10)].iter();
     let some = some
         .map(|(frame, _)| frame.read())
@@ -63,18 +69,16 @@ fn main() -> Result<(), Failure> {
         num_particles: 10_000,
         ..LocalizerConfig::default()
     };
-    for (number, (frame, truth)) in scans.iter().step_by(step).enumerate() {
+    for (number, start) in (0..scans.len()).step_by(step).enumerate() {
+        let (frame, truth) = &scans[start];
         let scan = frame.read()?;
         let begin = Instant::now();
         let mut localizer =
             Localizer::new(&map, &sensor, config.clone(), Start::Road, number as u64)?;
-        let pose = localizer.step(&scan, Odometry::Unknown)?.pose;
+        let first = localizer.step(&scan, Odometry::Unknown)?;
+        let pose = first.pose;
         let time_s = begin.elapsed().as_secs_f64();
-        let error = pose2_from_pose3(truth).inverse() * pose;
-        let (off_m, turn_deg) = (
-            error.translation.vector.norm(),
-            error.rotation.angle().to_degrees().abs(),
-        );
+        let [off_m, turn_deg] = off(&pose, truth);
         let is_found = off_m < 0.5 && turn_deg < 1.0;
         if number == 0 {
             println!("first start {time_s:.2} s, {}", memory());
@@ -86,6 +90,16 @@ fn main() -> Result<(), Failure> {
         }
         found += usize::from(is_found);
         all += 1;
+        drives.add(number, &first, truth);
+        let end = scans.len().min(start + scans_each);
+        for pair in scans[start..end].windows(2) {
+            let [(_, before), (frame, truth)] = pair else {
+                continue;
+            };
+            let motion = Odometry::Motion(before.inverse() * truth);
+            let estimate = localizer.step(&frame.read()?, motion)?;
+            drives.add(number, &estimate, truth);
+        }
     }
     times_s.sort_by(f64::total_cmp);
     println!(
@@ -94,7 +108,48 @@ fn main() -> Result<(), Failure> {
         times_s.last().unwrap_or(&0.0),
         memory()
     );
+    println!("{drives:?}");
     Ok(())
+}
+
+/// What became of the scans of all drives.
+#[derive(Debug, Default)]
+struct Drives {
+    scans: usize,
+    /// Called tracking.
+    tracking: usize,
+    /// Called tracking, and more than half a metre off.
+    tracking_wrong: usize,
+    /// Less than half a metre off, and not called tracking.
+    right_not_tracking: usize,
+    /// Largest error of those called tracking [m].
+    worst_tracking_m: f64,
+}
+
+impl Drives {
+    fn add(&mut self, start: usize, estimate: &Estimate, truth: &Pose3) {
+        const WRONG_M: f64 = 0.5;
+        // In space: the storey counts.
+        let shift_m = estimate.map_from_lidar.translation.vector - truth.translation.vector;
+        let (off_m, is_tracking) = (shift_m.norm(), estimate.state == State::Tracking);
+        self.scans += 1;
+        self.tracking += usize::from(is_tracking);
+        self.right_not_tracking += usize::from(!is_tracking && off_m < WRONG_M);
+        if is_tracking {
+            self.worst_tracking_m = self.worst_tracking_m.max(off_m);
+            if off_m >= WRONG_M {
+                self.tracking_wrong += 1;
+                println!("start {start}: tracking {off_m:.2} m off");
+            }
+        }
+    }
+}
+
+/// How far a pose is from the true one [m, deg].
+fn off(pose: &Pose2, truth: &Pose3) -> [f64; 2] {
+    let error = pose2_from_pose3(truth).inverse() * pose;
+    let turn_deg = error.rotation.angle().to_degrees().abs();
+    [error.translation.vector.norm(), turn_deg]
 }
 
 /// Memory of the process now and at most.
