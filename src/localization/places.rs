@@ -6,11 +6,15 @@
 //!
 //! ```text
 //! W_p ∝ W_p · exp(−max(0, d_p − min d − d₀) / s)          W_p: weight of the particles of place p before
+//! d₀ = max(tolerance, 2 √Σ_k (d_pk − d_qk)²)               q: place of least cost, d_pk: part of sector k of the scan in d_p
 //! ```
 //!
-//! Maps are off by d₀: costs that differ by less decide nothing, so that places that look alike remain until driving
-//! tells them apart. Each place keeps a number of particles however small its weight is. Milstein, Sánchez and
-//! Williamson, *Robust Global Localization Using Clustered Particle Filtering*, AAAI 2002, for particles per cluster.
+//! Maps are off by the tolerance: costs that differ by less decide nothing, so that places that look alike remain until
+//! driving tells them apart. Neither does what one object decides that has changed since, as a parked car: if each sector
+//! favors either place by chance, the sum of the differences has the standard deviation √Σ (d_pk − d_qk)² (the sign-flip
+//! test, Fisher, *The Design of Experiments*, 1935, section 21). Each place keeps a number of particles however small its
+//! weight is. Milstein, Sánchez and Williamson, *Robust Global Localization Using Clustered Particle Filtering*, AAAI
+//! 2002, for particles per cluster.
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -81,7 +85,7 @@ pub fn is_same(a: &Pose2, b: &Pose2, radius_m: f64) -> bool {
 }
 
 /// Whether two particles are in the same place, on the same level of the ground.
-fn is_same_level(a: &Particle, b: &Particle, radius_m: f64) -> bool {
+fn is_same_place(a: &Particle, b: &Particle, radius_m: f64) -> bool {
     let apart_m = a.level_m.zip(b.level_m).map_or(0.0, |(a, b)| (a - b).abs());
     apart_m < LEVEL_GAP_M && is_same(&a.map_from_lidar, &b.map_from_lidar, radius_m)
 }
@@ -103,7 +107,7 @@ pub fn best_of_each<'a>(
         if chosen.len() == most {
             break;
         }
-        let is_here = |&other: &usize| is_same_level(particles[other], particles[index], radius_m);
+        let is_here = |&other: &usize| is_same_place(particles[other], particles[index], radius_m);
         if !chosen.iter().any(is_here) {
             chosen.push(index);
         }
@@ -115,7 +119,7 @@ pub fn best_of_each<'a>(
 pub fn weights_in(places: &[Particle], particles: &[Particle], radius_m: f64) -> Vec<f64> {
     let mut weights = vec![0.0; places.len()];
     for particle in particles {
-        let is_here = |place: &Particle| is_same_level(place, particle, radius_m);
+        let is_here = |place: &Particle| is_same_place(place, particle, radius_m);
         if let Some(place) = places.iter().position(is_here) {
             weights[place] += particle.weight;
         }
@@ -123,14 +127,17 @@ pub fn weights_in(places: &[Particle], particles: &[Particle], radius_m: f64) ->
     weights
 }
 
-/// Weights of places after a scan, which sum to one: those before, and the costs of the registered poses [m]. Places
-/// that are given up have none.
-pub fn weights_after(before: &[f64], costs_m: &[f64], config: &PlacesConfig) -> Vec<f64> {
-    let least_m = costs_m.iter().copied().fold(f64::INFINITY, f64::min);
-    let likelihood =
-        |cost_m: f64| (-(cost_m - least_m - config.tolerance_m).max(0.0) / config.scale_m).exp();
+/// Weights of places after a scan, which sum to one: those before, and the parts that each sector of the scan has in the
+/// mean cost of the registered poses [m]. Places that are given up have none.
+pub fn weights_after(before: &[f64], costs_m: &[Vec<f64>], config: &PlacesConfig) -> Vec<f64> {
+    let sum_m = |costs_m: &&Vec<f64>| costs_m.iter().sum::<f64>();
+    let Some(least_m) = (costs_m.iter()).min_by(|a, b| sum_m(a).total_cmp(&sum_m(b))) else {
+        return Vec::new();
+    };
     let mut weights: Vec<f64> = (before.iter().zip(costs_m))
-        .map(|(weight, &cost_m)| weight * likelihood(cost_m))
+        .map(|(weight, costs_m)| {
+            weight * (-excess_m(costs_m, least_m, config) / config.scale_m).exp()
+        })
         .collect();
     for least in [0.0, config.given_up_weight] {
         let sum: f64 = weights.iter().sum();
@@ -143,6 +150,17 @@ pub fn weights_after(before: &[f64], costs_m: &[f64], config: &PlacesConfig) -> 
         }
     }
     weights
+}
+
+/// By how much costs exceed others more than maps are off and than chance explains [m].
+fn excess_m(costs_m: &[f64], least_m: &[f64], config: &PlacesConfig) -> f64 {
+    /// Standard deviations that chance explains.
+    const SIGMAS: f64 = 2.0;
+    let differences_m = (costs_m.iter().zip(least_m)).map(|(cost_m, least_m)| cost_m - least_m);
+    let [sum_m, squares] = differences_m.fold([0.0; 2], |[sum_m, squares], difference_m| {
+        [sum_m + difference_m, squares + difference_m.powi(2)]
+    });
+    (sum_m - config.tolerance_m.max(SIGMAS * squares.sqrt())).max(0.0)
 }
 
 #[cfg(test)]
@@ -184,16 +202,21 @@ mod tests {
         assert_eq!(weights_in(places, set.particles(), 5.0), [0.75, 0.25]);
     }
 
+    /// Parts of a cost of which each sector of a scan has the same.
+    fn evenly(cost_m: f64) -> Vec<f64> {
+        vec![cost_m / 24.0; 24]
+    }
+
     #[test]
     fn costs_that_differ_by_less_than_maps_are_off_decide_nothing() {
         let config = PlacesConfig::default();
         let mut weights = vec![0.5, 0.5];
         for _ in 0..1000 {
-            weights = weights_after(&weights, &[0.050, 0.059], &config);
+            weights = weights_after(&weights, &[0.050, 0.059].map(evenly), &config);
         }
         assert_relative_eq!(weights[0], 0.5, epsilon = 1e-9);
         // 1 cm more than that is two scales.
-        let weights = weights_after(&weights, &[0.05, 0.07], &config);
+        let weights = weights_after(&weights, &[0.05, 0.07].map(evenly), &config);
         assert_relative_eq!(weights[1] / weights[0], (-2.0_f64).exp(), epsilon = 1e-9);
     }
 
@@ -203,14 +226,37 @@ mod tests {
         let before = [0.2, 0.5, 0.3];
         let (a, b) = ([0.1, 0.13, 0.3], [0.5, 0.53, 0.7]);
         let (a, b) = (
-            weights_after(&before, &a, &config),
-            weights_after(&before, &b, &config),
+            weights_after(&before, &a.map(evenly), &config),
+            weights_after(&before, &b.map(evenly), &config),
         );
         assert_relative_eq!(a.iter().sum::<f64>(), 1.0, epsilon = 1e-12);
         for (a, b) in a.iter().zip(&b) {
             assert_relative_eq!(*a, *b, epsilon = 1e-9);
         }
         assert_eq!(a[2], 0.0, "a place of no weight is given up");
+    }
+
+    #[test]
+    fn differences_in_few_sectors_and_those_that_favor_either_place_decide_nothing() {
+        let config = PlacesConfig::default();
+        // Sectors in which the second place is worse by 1 cm of the mean cost, and in which it is better by that.
+        for (worse, better, is_decided) in [
+            (1, 0, false),
+            (4, 0, false),
+            (6, 0, true),
+            (12, 6, false),
+            (16, 2, true),
+            (24, 0, true),
+        ] {
+            let mut costs_m = [evenly(0.24), evenly(0.24)];
+            costs_m[1][..worse].fill(0.02);
+            costs_m[1][worse..worse + better].fill(0.0);
+            let weights = weights_after(&[0.5, 0.5], &costs_m, &config);
+            assert_eq!(weights[1] < 0.5, is_decided, "{worse} {better}");
+            costs_m.swap(0, 1);
+            let swapped = weights_after(&[0.5, 0.5], &costs_m, &config);
+            assert_eq!(swapped[0], weights[1]);
+        }
     }
 
     #[test]

@@ -12,11 +12,13 @@ use super::reweight::{Others, Update};
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
-use crate::localization::observation::{choose_beams, costs_of_scan, ground_patch_of};
+use crate::localization::observation::{Likelihood, choose_beams, costs_of_scan, ground_patch_of};
 use crate::localization::particles::{Particle, ParticleSet};
-use crate::localization::places::{best_of_each, is_same, weights_after, weights_in};
+use crate::localization::places::{
+    best_of_each, is_same, weights_after, weights_in,
+};
 use crate::localization::proposal::{Gaussian, regular};
-use crate::map::{GroundPatch, SensorAttitude};
+use crate::map::{GroundPatch, LEVEL_GAP_M, SensorAttitude};
 use crate::registration::{RegistrationResult, approach_widely, register};
 use crate::rendering::RenderError;
 
@@ -77,23 +79,25 @@ impl ParticleFilter {
             self.config.observation.road_share,
         );
         let beams = choose_beams(scan, count, road_share, attitude, rng);
-        let costs_m = self.costs_of_places(&registered, (scan, &beams))?;
+        let by_sector_m = self.costs_of_places(&registered, (scan, &beams))?;
+        let sum_m = |costs_m: &Vec<f64>| costs_m.iter().sum::<f64>();
+        let costs_m: Vec<Option<f64>> = (by_sector_m.iter())
+            .map(|it| it.as_ref().map(sum_m))
+            .collect();
         let particles: Vec<Particle> = registered.iter().map(PlaceHypothesis::particle).collect();
-        let (places, costs_m): (Vec<&PlaceHypothesis>, Vec<f64>) =
+        let (places, by_sector_m): (Vec<&PlaceHypothesis>, Vec<Vec<f64>>) =
             (best_of_each(&particles, &costs_m, config.most, config.radius_m).into_iter())
-                .filter_map(|index| Some((&registered[index], costs_m[index]?)))
+                .filter_map(|index| Some((&registered[index], by_sector_m[index].clone()?)))
                 .unzip();
         let before = self.weights_before(&places, config.radius_m);
-        let weights = weights_after(&before, &costs_m, &config);
+        let weights = weights_after(&before, &by_sector_m, &config);
         let Some(best) = (0..places.len()).max_by(|&a, &b| weights[a].total_cmp(&weights[b]))
         else {
             return Ok(None);
         };
         let attitude = places[best].patch.attitude_of(&places[best].map_from_lidar);
-        let mean_cost_m = weights
-            .iter()
-            .zip(&costs_m)
-            .map(|(weight, cost_m)| weight * cost_m);
+        let mean_cost_m =
+            (weights.iter().zip(&by_sector_m)).map(|(weight, costs_m)| weight * sum_m(costs_m));
         let mean_cost_m = Some(mean_cost_m.sum::<f64>() / weights.iter().sum::<f64>());
         self.sample_places(&places, &weights, rng);
         let likely = weights
@@ -188,12 +192,14 @@ impl ParticleFilter {
         let registration = self.config.proposal.registration.cautious();
         let registration = registration.with_tolerance(TOLERANCE_M);
         let places = &self.config.places;
-        let is_in =
-            |place: &Pose2, pose: &Pose3| is_same(place, &pose2_from_pose3(pose), places.radius_m);
+        let is_in = |(start, place): &(Pose3, Pose2), pose: &Pose3| {
+            let risen_m = pose.translation.z - start.translation.z;
+            risen_m.abs() < LEVEL_GAP_M && is_same(place, &pose2_from_pose3(pose), places.radius_m)
+        };
         let half: Vec<Beam> = beams.iter().step_by(2).copied().collect();
-        let approach = |(start, place): &(Pose3, Pose2)| {
-            let near = approach_widely(renderer, &half, start, WIDE_KERNEL_M, &registration)?;
-            Ok(Some(near).filter(|near| is_in(place, near)))
+        let approach = |at: &(Pose3, Pose2)| {
+            let near = approach_widely(renderer, &half, &at.0, WIDE_KERNEL_M, &registration)?;
+            Ok(Some(near).filter(|near| is_in(at, near)))
         };
         let near: Result<Vec<Option<Pose3>>, RenderError> =
             starts.par_iter().map(approach).collect();
@@ -202,18 +208,18 @@ impl ParticleFilter {
         let costs_m = costs_of_scan(renderer, &near, (scan, beams), observation)?;
         let least_m = (costs_m.iter().flatten()).fold(f64::INFINITY, |least, m| least.min(*m));
         let most_m = least_m + EXCESS_FACTOR * places.excess_given_up_m();
-        let register =
-            |((near, cost_m), (_, place)): ((&Option<Pose3>, &Option<f64>), &(_, Pose2))| {
-                let Some(near) = near.filter(|_| cost_m.is_none_or(|cost_m| cost_m <= most_m))
-                else {
-                    return Ok(None);
-                };
-                let found = register(renderer, beams, &near, &registration)?;
-                Ok(found.filter(|found| is_in(place, &found.map_from_lidar)))
+        let is_left = |cost_m: &Option<f64>| cost_m.is_some_and(|cost_m| cost_m <= most_m);
+        let left: Vec<Option<Pose3>> = (near.iter().zip(&costs_m))
+            .map(|(near, cost_m)| near.filter(|_| is_left(cost_m)))
+            .collect();
+        let register = |(near, at): (&Option<Pose3>, &(Pose3, Pose2))| {
+            let Some(near) = near else {
+                return Ok(None);
             };
-        (near.par_iter().zip(&costs_m).zip(starts))
-            .map(register)
-            .collect()
+            let found = register(renderer, beams, near, &registration)?;
+            Ok(found.filter(|found| is_in(at, &found.map_from_lidar)))
+        };
+        left.par_iter().zip(starts).map(register).collect()
     }
 
     /// Registers the scan at particles.
@@ -252,17 +258,42 @@ impl ParticleFilter {
         Ok(all.filter_map(place).collect())
     }
 
+    /// Parts of the sectors of a scan in its mean cost at each place [m]; `None` off the map.
     fn costs_of_places(
         &self,
         places: &[PlaceHypothesis],
-        scan_and_beams: (&RangeImage, &[Beam]),
-    ) -> Result<Vec<Option<f64>>, RenderError> {
+        (scan, beams): (&RangeImage, &[Beam]),
+    ) -> Result<Vec<Option<Vec<f64>>>, RenderError> {
+        /// Number of sectors: a car that is parked next to the road takes one or two.
+        const SECTORS: usize = 24;
         let poses: Vec<_> = places
             .iter()
             .map(|place| Some(place.map_from_lidar))
             .collect();
         let observation = &self.config.observation;
-        costs_of_scan(&*self.map.renderer, &poses, scan_and_beams, observation)
+        let mut sectors = vec![Vec::new(); SECTORS];
+        match observation.likelihood {
+            Likelihood::Reference => sectors[0] = beams.to_vec(),
+            Likelihood::Robust => {
+                for beam in beams {
+                    let turns = beam.direction.y.atan2(beam.direction.x) / std::f32::consts::TAU;
+                    let sector = (turns.rem_euclid(1.0) * SECTORS as f32) as usize;
+                    sectors[sector.min(SECTORS - 1)].push(*beam);
+                }
+            }
+        }
+        let mut all_m = vec![Some(Vec::new()); places.len()];
+        for sector in sectors.iter().filter(|sector| !sector.is_empty()) {
+            let share = sector.len() as f64 / beams.len() as f64;
+            let costs_m = costs_of_scan(&*self.map.renderer, &poses, (scan, sector), observation)?;
+            for (all_m, cost_m) in all_m.iter_mut().zip(costs_m) {
+                match (all_m.as_mut(), cost_m) {
+                    (Some(all_m), Some(cost_m)) => all_m.push(share * cost_m),
+                    _ => *all_m = None,
+                }
+            }
+        }
+        Ok(all_m)
     }
 
     /// Weights of the places in the prediction. Those of the first scan are equal: the panoramas from which the
