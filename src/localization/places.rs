@@ -85,7 +85,7 @@ pub fn is_same(a: &Pose2, b: &Pose2, radius_m: f64) -> bool {
 }
 
 /// Whether two particles are in the same place, on the same level of the ground.
-fn is_same_place(a: &Particle, b: &Particle, radius_m: f64) -> bool {
+pub fn is_same_place(a: &Particle, b: &Particle, radius_m: f64) -> bool {
     let apart_m = a.level_m.zip(b.level_m).map_or(0.0, |(a, b)| (a - b).abs());
     apart_m < LEVEL_GAP_M && is_same(&a.map_from_lidar, &b.map_from_lidar, radius_m)
 }

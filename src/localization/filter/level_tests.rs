@@ -254,3 +254,21 @@ fn a_start_anywhere_finds_its_level() {
         follow(&crossing, filter, truth, &mut rng);
     }
 }
+
+#[test]
+fn particles_on_the_wrong_level_find_the_other_one_in_the_first_scan() {
+    let crossing = Crossing::new();
+    // On the deck and below it.
+    for (seed, truth, wrong_m) in [(3, upper_drive()[44], 0.0), (4, lower_drive()[33], DECK_M)] {
+        let mut rng = StdRng::seed_from_u64(seed);
+        let (pose, scan) = (pose2_from_pose3(&truth), crossing.scan(&truth));
+        let start = around(&pose, Some(wrong_m), 500, &StartSpread::default(), &mut rng);
+        let (config, map) = (LocalizerConfig::of_test(500), crossing.map.clone());
+        let filter = ParticleFilter::new(config, map, None, ParticleSet::uniform(start));
+        let mut filter = filter.unwrap().searching_anywhere();
+        let attitude = SensorAttitude::default();
+        let found = filter.step(Odometry::Unknown, &scan, &attitude, &mut rng);
+        let off = found.unwrap().map_from_lidar.translation.vector - truth.translation.vector;
+        assert!(off.norm() < 0.2, "{off}");
+    }
+}

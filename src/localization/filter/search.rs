@@ -15,7 +15,7 @@ use crate::lidar::{Beam, RangeImage};
 use crate::localization::observation::{Likelihood, choose_beams, costs_of_scan, ground_patch_of};
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::{
-    best_of_each, is_same, weights_after, weights_in,
+    best_of_each, is_same, is_same_place, weights_after, weights_in,
 };
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::{GroundPatch, LEVEL_GAP_M, SensorAttitude};
@@ -72,7 +72,13 @@ impl ParticleFilter {
         rng: &mut impl Rng,
     ) -> Result<Option<Update>, RenderError> {
         let config = self.config.places.clone();
-        let seeds = self.best_particles(scan, attitude, rng)?;
+        let best = self.best_particles(scan, attitude, rng)?;
+        let mut seeds: Vec<Particle> = (best.into_iter())
+            .map(|index| self.particles.particles()[index])
+            .collect();
+        if self.is_first_search() {
+            seeds.extend(self.on_other_levels(&seeds)?);
+        }
         let registered = self.registered_places(&seeds, scan, attitude, rng)?;
         let (count, road_share) = (
             self.config.observation.beams,
@@ -139,6 +145,25 @@ impl ParticleFilter {
         });
         let unique: BTreeSet<usize> = best.into_iter().flatten().collect();
         Ok(unique.into_iter().collect())
+    }
+
+    /// Particles below and above others, on the other levels of the ground. Storeys of a building are alike, and of many places that
+    /// are alike only some are searched: those of each storey.
+    fn on_other_levels(&self, particles: &[Particle]) -> Result<Vec<Particle>, RenderError> {
+        let mut found = Vec::new();
+        for particle in particles {
+            let [x, y] = particle.map_from_lidar.translation.vector.into();
+            let levels = self.map.ground.levels_at(x, y)?;
+            let at_level = |level: &GroundPatch| Particle {
+                level_m: Some(level.height_m),
+                ..*particle
+            };
+            let is_new = |other: &Particle| {
+                (particles.iter()).all(|known| !is_same_place(known, other, APART_M))
+            };
+            found.extend(levels.iter().map(at_level).filter(is_new));
+        }
+        Ok(found)
     }
 
     /// Whether no places have been registered yet.
@@ -225,7 +250,7 @@ impl ParticleFilter {
     /// Registers the scan at particles.
     fn registered_places(
         &self,
-        seeds: &[usize],
+        seeds: &[Particle],
         scan: &RangeImage,
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
@@ -233,8 +258,7 @@ impl ParticleFilter {
         let road_share = self.config.proposal.road_share;
         let beams = choose_beams(scan, PLACE_BEAMS, road_share, attitude, rng);
         let (mut starts, mut patches) = (Vec::new(), Vec::new());
-        for &seed in seeds {
-            let particle = &self.particles.particles()[seed];
+        for particle in seeds {
             if let Some(patch) = ground_patch_of(particle, &self.map, None)? {
                 let place = particle.map_from_lidar;
                 starts.push((patch.lift(&place, attitude), place));
