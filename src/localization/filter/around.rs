@@ -18,7 +18,8 @@ use crate::rendering::RenderError;
 
 impl ParticleFilter {
     /// Compares the pose in space to which a scan led with others around the prediction, by the mean costs of the same beams. Returns
-    /// the distribution around a better one, if there is one that the sensor can have reached, and how others fit.
+    /// the distribution around a better one, with which as many beams agree, if there is one that the sensor can have reached, and how
+    /// others fit.
     pub(super) fn search_around(
         &self,
         scan: &RangeImage,
@@ -43,7 +44,10 @@ impl ParticleFilter {
         let here_m = costs_m[0].unwrap_or(f64::INFINITY);
         let least_m = (found.alike.iter()).fold(f64::INFINITY, |least, (_, m)| least.min(*m));
         let tolerance_m = self.config.places.tolerance_m;
-        let is_better = least_m + tolerance_m < here_m;
+        // At the end of a map the cost is also less where more beams meet it.
+        let agreement_at = |pose| self.agreement_at(pose, beams, attitude.0);
+        let is_better = least_m + tolerance_m < here_m
+            && agreement_at(&found.alike[0].0)? >= agreement_at(here)?;
         let predicted = self.particles.mean();
         if is_better && found.refutes && !self.is_reachable(&predicted, &found.gaussian.mean) {
             return Ok((None, Others::Alike));

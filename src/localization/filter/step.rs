@@ -247,7 +247,7 @@ impl ParticleFilter {
     }
 
     /// Share of the beams above the road that agree with the map at a pose.
-    fn agreement_at(
+    pub(super) fn agreement_at(
         &self,
         map_from_lidar: &Pose3,
         beams: &[Beam],
