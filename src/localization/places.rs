@@ -6,15 +6,16 @@
 //!
 //! ```text
 //! W_p ∝ W_p · exp(−max(0, d_p − min d − d₀) / s)          W_p: weight of the particles of place p before
-//! d₀ = max(tolerance, 2 √Σ_k (d_pk − d_qk)²)               q: place of least cost, d_pk: part of sector k of the scan in d_p
+//! d₀ = tolerance                                          between places on one level of the ground
+//! d₀ = max(tolerance, 2 √Σ_k (d_pk − d_qk)²)              on different ones; d_pk: part of sector k in d_p, q: place of min d
 //! ```
 //!
 //! Maps are off by the tolerance: costs that differ by less decide nothing, so that places that look alike remain until
-//! driving tells them apart. Neither does what one object decides that has changed since, as a parked car: if each sector
-//! favors either place by chance, the sum of the differences has the standard deviation √Σ (d_pk − d_qk)² (the sign-flip
-//! test, Fisher, *The Design of Experiments*, 1935, section 21). Each place keeps a number of particles however small its
-//! weight is. Milstein, Sánchez and Williamson, *Robust Global Localization Using Clustered Particle Filtering*, AAAI
-//! 2002, for particles per cluster.
+//! driving tells them apart. Storeys of a building are alike but for what stands there, such as parked cars, which change: if
+//! each sector of the scan favors either storey by chance, the sum of the differences has the standard deviation
+//! √Σ (d_pk − d_qk)² (the sign-flip test, Fisher, *The Design of Experiments*, 1935, section 21). Each place keeps a number of
+//! particles however small its weight is. Milstein, Sánchez and Williamson, *Robust Global Localization Using Clustered
+//! Particle Filtering*, AAAI 2002, for particles per cluster.
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -84,10 +85,15 @@ pub fn is_same(a: &Pose2, b: &Pose2, radius_m: f64) -> bool {
         && between.rotation.angle().abs() < SAME_HEADING_RAD
 }
 
+/// Whether two heights of the ground are on one level [m]; those that are not known are.
+fn is_one_level(a_m: Option<f64>, b_m: Option<f64>) -> bool {
+    a_m.zip(b_m)
+        .is_none_or(|(a, b)| (a - b).abs() < LEVEL_GAP_M)
+}
+
 /// Whether two particles are in the same place, on the same level of the ground.
 pub fn is_same_place(a: &Particle, b: &Particle, radius_m: f64) -> bool {
-    let apart_m = a.level_m.zip(b.level_m).map_or(0.0, |(a, b)| (a - b).abs());
-    apart_m < LEVEL_GAP_M && is_same(&a.map_from_lidar, &b.map_from_lidar, radius_m)
+    is_one_level(a.level_m, b.level_m) && is_same(&a.map_from_lidar, &b.map_from_lidar, radius_m)
 }
 
 /// Indices of the particles of least cost in each of at most `most` places; particles without a cost are left out.
@@ -127,19 +133,47 @@ pub fn weights_in(places: &[Particle], particles: &[Particle], radius_m: f64) ->
     weights
 }
 
-/// Weights of places after a scan, which sum to one: those before, and the parts that each sector of the scan has in the
-/// mean cost of the registered poses [m]. Places that are given up have none.
-pub fn weights_after(before: &[f64], costs_m: &[Vec<f64>], config: &PlacesConfig) -> Vec<f64> {
-    let sum_m = |costs_m: &&Vec<f64>| costs_m.iter().sum::<f64>();
-    let Some(least_m) = (costs_m.iter()).min_by(|a, b| sum_m(a).total_cmp(&sum_m(b))) else {
+/// What is compared of a place.
+#[derive(Clone)]
+pub struct PlaceCosts {
+    /// Parts that each sector of a scan has in its mean cost at the registered pose [m].
+    pub by_sector_m: Vec<f64>,
+    /// Height of the ground [m].
+    pub level_m: Option<f64>,
+}
+
+impl PlaceCosts {
+    /// Mean cost [m].
+    pub fn mean_m(&self) -> f64 {
+        self.by_sector_m.iter().sum()
+    }
+
+    /// By how much the mean cost exceeds that of another place more than maps are off and than chance explains [m].
+    fn excess_m(&self, least: &Self, tolerance_m: f64) -> f64 {
+        /// Standard deviations that chance explains.
+        const SIGMAS: f64 = 2.0;
+        let by_sector_m = self.by_sector_m.iter().zip(&least.by_sector_m);
+        let squares = by_sector_m.map(|(cost_m, least_m)| (cost_m - least_m).powi(2));
+        let by_chance_m = if is_one_level(self.level_m, least.level_m) {
+            0.0
+        } else {
+            SIGMAS * squares.sum::<f64>().sqrt()
+        };
+        (self.mean_m() - least.mean_m() - tolerance_m.max(by_chance_m)).max(0.0)
+    }
+}
+
+/// Weights of places after a scan, which sum to one: those before, and the costs of the scan. Places that are given up have none.
+pub fn weights_after(before: &[f64], costs: &[PlaceCosts], config: &PlacesConfig) -> Vec<f64> {
+    let Some(least) = (costs.iter()).min_by(|a, b| a.mean_m().total_cmp(&b.mean_m())) else {
         return Vec::new();
     };
-    let mut weights: Vec<f64> = (before.iter().zip(costs_m))
-        .map(|(weight, costs_m)| {
-            weight * (-excess_m(costs_m, least_m, config) / config.scale_m).exp()
-        })
+    let likelihood =
+        |costs: &PlaceCosts| (-costs.excess_m(least, config.tolerance_m) / config.scale_m).exp();
+    let mut weights: Vec<f64> = (before.iter().zip(costs))
+        .map(|(weight, costs)| weight * likelihood(costs))
         .collect();
-    for least in [0.0, config.given_up_weight] {
+    for least in [config.given_up_weight, 0.0] {
         let sum: f64 = weights.iter().sum();
         for weight in &mut weights {
             *weight = if *weight >= least * sum {
@@ -150,17 +184,6 @@ pub fn weights_after(before: &[f64], costs_m: &[Vec<f64>], config: &PlacesConfig
         }
     }
     weights
-}
-
-/// By how much costs exceed others more than maps are off and than chance explains [m].
-fn excess_m(costs_m: &[f64], least_m: &[f64], config: &PlacesConfig) -> f64 {
-    /// Standard deviations that chance explains.
-    const SIGMAS: f64 = 2.0;
-    let differences_m = (costs_m.iter().zip(least_m)).map(|(cost_m, least_m)| cost_m - least_m);
-    let [sum_m, squares] = differences_m.fold([0.0; 2], |[sum_m, squares], difference_m| {
-        [sum_m + difference_m, squares + difference_m.powi(2)]
-    });
-    (sum_m - config.tolerance_m.max(SIGMAS * squares.sqrt())).max(0.0)
 }
 
 #[cfg(test)]
@@ -202,9 +225,12 @@ mod tests {
         assert_eq!(weights_in(places, set.particles(), 5.0), [0.75, 0.25]);
     }
 
-    /// Parts of a cost of which each sector of a scan has the same.
-    fn evenly(cost_m: f64) -> Vec<f64> {
-        vec![cost_m / 24.0; 24]
+    /// A cost of which each sector of a scan has the same part.
+    fn evenly(cost_m: f64) -> PlaceCosts {
+        PlaceCosts {
+            by_sector_m: vec![cost_m / 24.0; 24],
+            level_m: Some(0.0),
+        }
     }
 
     #[test]
@@ -237,25 +263,29 @@ mod tests {
     }
 
     #[test]
-    fn differences_in_few_sectors_and_those_that_favor_either_place_decide_nothing() {
+    fn on_another_level_differences_in_few_sectors_and_those_that_favor_either_place_decide_nothing()
+     {
         let config = PlacesConfig::default();
         // Sectors in which the second place is worse by 1 cm of the mean cost, and in which it is better by that.
         for (worse, better, is_decided) in [
-            (1, 0, false),
             (4, 0, false),
             (6, 0, true),
             (12, 6, false),
             (16, 2, true),
             (24, 0, true),
         ] {
-            let mut costs_m = [evenly(0.24), evenly(0.24)];
-            costs_m[1][..worse].fill(0.02);
-            costs_m[1][worse..worse + better].fill(0.0);
-            let weights = weights_after(&[0.5, 0.5], &costs_m, &config);
-            assert_eq!(weights[1] < 0.5, is_decided, "{worse} {better}");
-            costs_m.swap(0, 1);
-            let swapped = weights_after(&[0.5, 0.5], &costs_m, &config);
-            assert_eq!(swapped[0], weights[1]);
+            for (level_m, is_decided) in [(Some(2.5), is_decided), (Some(1.5), true), (None, true)]
+            {
+                let mut costs = [evenly(0.24), evenly(0.24)];
+                costs[1].by_sector_m[..worse].fill(0.02);
+                costs[1].by_sector_m[worse..worse + better].fill(0.0);
+                costs[1].level_m = level_m;
+                let weights = weights_after(&[0.5, 0.5], &costs, &config);
+                assert_eq!(weights[1] < 0.5, is_decided, "{worse} {better} {level_m:?}");
+                costs.swap(0, 1);
+                let swapped = weights_after(&[0.5, 0.5], &costs, &config);
+                assert_eq!(swapped[0], weights[1]);
+            }
         }
     }
 

@@ -185,7 +185,7 @@ fn places_weigh_by_the_particles_in_them_and_by_the_costs_of_their_scans() {
     let start = ParticleSet::uniform([a, b]);
     let mut filter = ParticleFilter::new(config, map, None, start).unwrap();
     let mut rng = StdRng::seed_from_u64(1);
-    let attitude = SensorAttitude::default();
+    let (scan, attitude) = (street.scan(&a), SensorAttitude::default());
     // Before the first scan, places weigh the same: their panoramas were compared with it.
     for (before, likely) in [([0.3, 0.7], 2), ([0.9, 0.1], 1)] {
         let is_first = filter.phase.search() == Some(Search::Anywhere);
@@ -194,7 +194,7 @@ fn places_weigh_by_the_particles_in_them_and_by_the_costs_of_their_scans() {
             ..Particle::new(pose, Some(-1.73))
         });
         filter.particles = ParticleSet::weighted(weighted.into());
-        let update = filter.search_places(&empty_scan(), &attitude, &mut rng);
+        let update = filter.search_places(&scan, &attitude, &mut rng);
         let update = update.unwrap().unwrap();
         let before = if is_first { [0.5, 0.5] } else { before };
         let less_likely = before[1] * (-0.7_f64).exp();

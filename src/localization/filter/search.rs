@@ -15,7 +15,7 @@ use crate::lidar::{Beam, RangeImage};
 use crate::localization::observation::{Likelihood, choose_beams, costs_of_scan, ground_patch_of};
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::{
-    best_of_each, is_same, is_same_place, weights_after, weights_in,
+    PlaceCosts, best_of_each, is_same, is_same_place, weights_after, weights_in,
 };
 use crate::localization::proposal::{Gaussian, regular};
 use crate::map::{GroundPatch, LEVEL_GAP_M, SensorAttitude};
@@ -85,25 +85,24 @@ impl ParticleFilter {
             self.config.observation.road_share,
         );
         let beams = choose_beams(scan, count, road_share, attitude, rng);
-        let by_sector_m = self.costs_of_places(&registered, (scan, &beams))?;
-        let sum_m = |costs_m: &Vec<f64>| costs_m.iter().sum::<f64>();
-        let costs_m: Vec<Option<f64>> = (by_sector_m.iter())
-            .map(|it| it.as_ref().map(sum_m))
+        let found = self.costs_of_places(&registered, (scan, &beams))?;
+        let costs_m: Vec<Option<f64>> = (found.iter())
+            .map(|costs| costs.as_ref().map(PlaceCosts::mean_m))
             .collect();
         let particles: Vec<Particle> = registered.iter().map(PlaceHypothesis::particle).collect();
-        let (places, by_sector_m): (Vec<&PlaceHypothesis>, Vec<Vec<f64>>) =
+        let (places, costs): (Vec<&PlaceHypothesis>, Vec<PlaceCosts>) =
             (best_of_each(&particles, &costs_m, config.most, config.radius_m).into_iter())
-                .filter_map(|index| Some((&registered[index], by_sector_m[index].clone()?)))
+                .filter_map(|index| Some((&registered[index], found[index].clone()?)))
                 .unzip();
         let before = self.weights_before(&places, config.radius_m);
-        let weights = weights_after(&before, &by_sector_m, &config);
+        let weights = weights_after(&before, &costs, &config);
         let Some(best) = (0..places.len()).max_by(|&a, &b| weights[a].total_cmp(&weights[b]))
         else {
             return Ok(None);
         };
         let attitude = places[best].patch.attitude_of(&places[best].map_from_lidar);
         let mean_cost_m =
-            (weights.iter().zip(&by_sector_m)).map(|(weight, costs_m)| weight * sum_m(costs_m));
+            (weights.iter().zip(&costs)).map(|(weight, costs)| weight * costs.mean_m());
         let mean_cost_m = Some(mean_cost_m.sum::<f64>() / weights.iter().sum::<f64>());
         self.sample_places(&places, &weights, rng);
         let likely = weights
@@ -282,12 +281,12 @@ impl ParticleFilter {
         Ok(all.filter_map(place).collect())
     }
 
-    /// Parts of the sectors of a scan in its mean cost at each place [m]; `None` off the map.
+    /// Costs of a scan at each place; `None` off the map.
     fn costs_of_places(
         &self,
         places: &[PlaceHypothesis],
         (scan, beams): (&RangeImage, &[Beam]),
-    ) -> Result<Vec<Option<Vec<f64>>>, RenderError> {
+    ) -> Result<Vec<Option<PlaceCosts>>, RenderError> {
         /// Number of sectors: a car that is parked next to the road takes one or two.
         const SECTORS: usize = 24;
         let poses: Vec<_> = places
@@ -306,18 +305,22 @@ impl ParticleFilter {
                 }
             }
         }
-        let mut all_m = vec![Some(Vec::new()); places.len()];
+        let begin = |place: &PlaceHypothesis| PlaceCosts {
+            by_sector_m: Vec::new(),
+            level_m: Some(place.patch.height_m),
+        };
+        let mut all: Vec<_> = places.iter().map(|place| Some(begin(place))).collect();
         for sector in sectors.iter().filter(|sector| !sector.is_empty()) {
             let share = sector.len() as f64 / beams.len() as f64;
             let costs_m = costs_of_scan(&*self.map.renderer, &poses, (scan, sector), observation)?;
-            for (all_m, cost_m) in all_m.iter_mut().zip(costs_m) {
-                match (all_m.as_mut(), cost_m) {
-                    (Some(all_m), Some(cost_m)) => all_m.push(share * cost_m),
-                    _ => *all_m = None,
+            for (costs, cost_m) in all.iter_mut().zip(costs_m) {
+                match (costs.as_mut(), cost_m) {
+                    (Some(costs), Some(cost_m)) => costs.by_sector_m.push(share * cost_m),
+                    _ => *costs = None,
                 }
             }
         }
-        Ok(all_m)
+        Ok(all)
     }
 
     /// Weights of the places in the prediction. Those of the first scan are equal: the panoramas from which the
