@@ -17,7 +17,7 @@ const TOLERANCE: f64 = 1e-4;
 const MAX_ITERATIONS: usize = 300;
 
 /// Solves the depths 2 to `depth`, each starting from the solution of the coarser one.
-pub fn solve(samples: &Samples, depth: u32, weights: &SampleWeights) -> BaseGrid {
+pub fn solve(samples: &Samples, depth: u32, weights: &SampleWeights<'_>) -> BaseGrid {
     let mut solution = BaseGrid {
         cells: 4,
         values: vec![0.0; 5 * 5 * 5],
@@ -127,7 +127,7 @@ fn corner_offsets(cells: usize) -> [usize; 8] {
     std::array::from_fn(|corner| grid_index([corner & 1, corner >> 1 & 1, corner >> 2], cells))
 }
 
-fn constraints(samples: &Samples, depth: u32, weights: &SampleWeights) -> Vec<PointConstraint> {
+fn constraints(samples: &Samples, depth: u32, weights: &SampleWeights<'_>) -> Vec<PointConstraint> {
     let shift = 3 * (samples.depth - depth);
     let mut constraints = Vec::new();
     let mut begin = 0;

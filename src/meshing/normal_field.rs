@@ -19,7 +19,7 @@ pub struct CoarseField(Vec<[CornerValues; 3]>);
 
 impl CoarseField {
     /// The field on the base level.
-    pub fn base(samples: &Samples, level: &Level, weights: &SampleWeights) -> Self {
+    pub fn base(samples: &Samples, level: &Level, weights: &SampleWeights<'_>) -> Self {
         let grid = base_grid::splat(samples, level.depth, |sample| {
             (1.0 - weights.fraction_from(sample, level.depth + 1))
                 * weights.area(sample, level.depth)
@@ -32,7 +32,7 @@ impl CoarseField {
     }
 
     /// The field on the next level, with the samples that end there.
-    pub fn refined(&self, level: &Level, samples: &Samples, weights: &SampleWeights) -> Self {
+    pub fn refined(&self, level: &Level, samples: &Samples, weights: &SampleWeights<'_>) -> Self {
         let fraction = |sample: usize| {
             weights.fraction_from(sample, level.depth)
                 - weights.fraction_from(sample, level.depth + 1)
@@ -57,7 +57,7 @@ impl CoarseField {
         parents: &Level,
         level: &Level,
         samples: &Samples,
-        weights: &SampleWeights,
+        weights: &SampleWeights<'_>,
     ) -> Vec<OwnValues> {
         let fraction = |sample: usize| weights.fraction_from(sample, level.depth);
         let mut splatted = vec![[[0.0; CELLS]; 3]; level.len() + 1];
@@ -94,7 +94,7 @@ fn splat_node(
     level: &Level,
     node: usize,
     samples: &Samples,
-    weights: &SampleWeights,
+    weights: &SampleWeights<'_>,
     fraction: impl Fn(usize) -> f32,
     last: i32,
 ) -> [PaddedValues; 3] {

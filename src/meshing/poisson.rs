@@ -22,7 +22,7 @@ use super::density::DensityField;
 use super::error::MeshingError;
 use super::isosurface::{self, NodalFunction, UnitMesh};
 use super::normal_field::CoarseField;
-use super::octree::{BASE_DEPTH, Level, Octree};
+use super::octree::{Level, Octree};
 use super::samples::Samples;
 use super::solver;
 use super::stencil::{CORNER_OFFSETS, CornerValues, corner_index, interpolate, trilinear};
@@ -147,36 +147,24 @@ pub fn reconstruct_resolved(
     }
     let kernel_depth = samples.depth.saturating_sub(KERNEL_LEVELS).max(2);
     let density = DensityField::new(&samples, kernel_depth, config.samples_per_node);
-    let base_depth = samples.depth.min(BASE_DEPTH) as f32;
-    // Samples that are sparser than the base level are splatted at the base level.
-    let depths: Vec<f32> = (density.sample_depths(&samples).into_iter())
-        .map(|depth| depth.max(base_depth))
-        .collect();
-    let finest = (samples.positions.par_iter())
+    let depths = density.sample_depths(&samples);
+    let finest: Vec<f32> = (samples.positions.par_iter())
         .zip(&depths)
         .map(|(&position, &depth)| {
             let cells = (resolution_m(samples.to_cloud(position)) / cell_m).max(1.0);
-            let most = samples.depth as f32 - cells.log2();
-            depth.min(most).max(base_depth)
+            depth.min(samples.depth as f32 - cells.log2())
         })
         .collect();
-    let weights = SampleWeights::new(
-        &depths,
-        finest,
-        config.samples_per_node,
-        config.point_weight,
-    );
-    let (samples, weights) = weights.merge(&samples);
     let tree = Octree::build(&samples, samples.depth, |sample, depth| {
-        weights.finest(sample) > (depth - 1) as f32
+        finest[sample] > (depth - 1) as f32
     });
     require_memory(&tree, &samples, memory_budget)?;
-    let values = solve(&samples, &weights, &tree, config.iterations);
+    let values = solve(&samples, [&depths, &finest], &tree, config);
     let function = NodalFunction {
         tree: &tree,
         values: &values,
     };
-    let iso_value = mean_at_samples(&samples, &weights, &function);
+    let iso_value = mean_at_samples(&samples, &function);
     let surface = isosurface::extract(&function, iso_value);
     Ok(in_cloud_frame(surface, &samples, &density))
 }
@@ -201,51 +189,52 @@ fn require_memory(
 /// The values of χ at the corners of all nodes, per level.
 fn solve(
     samples: &Samples,
-    weights: &SampleWeights,
+    depths: [&[f32]; 2],
     tree: &Octree,
-    iterations: usize,
+    config: &PoissonConfig,
 ) -> Vec<Vec<CornerValues>> {
     let base = &tree.levels[0];
-    let mut coarse = CoarseField::base(samples, base, weights);
-    let mut values = vec![base_grid::solve(samples, base.depth, weights).into_nodes(base)];
+    // Samples that are sparser than the base level are splatted at the base level.
+    let [depths, finest] = depths.map(|depths| -> Vec<f32> {
+        (depths.iter().map(|depth| depth.max(base.depth as f32))).collect()
+    });
+    let weights = SampleWeights::new(
+        &depths,
+        &finest,
+        config.samples_per_node,
+        config.point_weight,
+    );
+    let mut coarse = CoarseField::base(samples, base, &weights);
+    let mut values = vec![base_grid::solve(samples, base.depth, &weights).into_nodes(base)];
     for (index, levels) in tree.levels.windows(2).enumerate() {
         let (parents, level) = (&levels[0], &levels[1]);
         values.push(solver::refine(
             (parents, &values[index]),
             level,
             samples,
-            weights,
+            &weights,
             &coarse,
-            iterations,
+            config.iterations,
         ));
         if index + 2 < tree.levels.len() {
-            coarse = coarse.refined(level, samples, weights);
+            coarse = coarse.refined(level, samples, &weights);
         }
     }
     values
 }
 
-/// Mean of χ at the points.
-fn mean_at_samples(
-    samples: &Samples,
-    weights: &SampleWeights,
-    function: &NodalFunction<'_>,
-) -> f32 {
+/// Mean of χ(s).
+fn mean_at_samples(samples: &Samples, function: &NodalFunction<'_>) -> f32 {
     const CHUNK: usize = 4096;
-    let terms = |sample| {
-        let count = f64::from(weights.count(sample));
-        let value = f64::from(value_at_sample(samples, function, sample));
-        [count, count * value]
-    };
-    let add = |[a, b]: [f64; 2], [c, d]: [f64; 2]| [a + c, b + d];
-    let parts: Vec<[f64; 2]> = (samples.codes.par_chunks(CHUNK).enumerate())
+    let value = |sample| f64::from(value_at_sample(samples, function, sample));
+    let parts: Vec<f64> = (samples.codes.par_chunks(CHUNK).enumerate())
         .map(|(chunk, codes)| {
             let samples = (chunk * CHUNK..).take(codes.len());
-            samples.map(terms).fold([0.0; 2], add)
+            samples.fold(0.0, |sum, sample| sum + value(sample))
         })
         .collect();
-    let [count, sum] = parts.into_iter().fold([0.0; 2], add);
-    (sum / count) as f32
+    let sum: f64 = parts.iter().fold(0.0, |sum, part| sum + part);
+    (sum / samples.len() as f64) as f32
 }
 
 fn value_at_sample(samples: &Samples, function: &NodalFunction<'_>, sample: usize) -> f32 {

@@ -1,7 +1,5 @@
 //! The input of the solver: oriented points in the unit cube, in Morton order.
 
-use std::ops::Range;
-
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -9,7 +7,7 @@ use super::error::MeshingError;
 use crate::geometry::morton;
 use crate::geometry::{Aabb, PointCloud};
 
-/// Points in the unit cube, sorted by the Morton codes of their cells; or the means of those in each cell.
+/// Points in the unit cube, sorted by the Morton codes of their cells.
 pub struct Samples {
     /// Depth of the cells of the codes.
     pub depth: u32,
@@ -17,7 +15,7 @@ pub struct Samples {
     pub codes: Vec<u64>,
     /// Positions in the unit cube.
     pub positions: Vec<[f32; 3]>,
-    /// Unit normals; of the mean of several points, their mean, which is shorter.
+    /// Unit normals.
     pub normals: Vec<[f32; 3]>,
     /// Lower corner of the cube in the frame of the cloud [m].
     origin: Vec3,
@@ -71,50 +69,6 @@ impl Samples {
             origin,
             side_m,
             dropped: cloud.len() - usable.len(),
-        })
-    }
-
-    /// The mean of the points in each cell, by their surface areas: the solver resolves nothing within a cell.
-    pub fn merged(&self, areas: &[f32]) -> Self {
-        let cells: Vec<Range<usize>> = self.cells().collect();
-        let mean = |of: &[[f32; 3]], cell: &Range<usize>| -> [f32; 3] {
-            let (of, areas) = (&of[cell.clone()], &areas[cell.clone()]);
-            let sum: f32 = areas.iter().sum();
-            let weighted =
-                |axis: usize| of.iter().zip(areas).map(move |(of, area)| area * of[axis]);
-            [0, 1, 2].map(|axis| weighted(axis).sum::<f32>() / sum)
-        };
-        let position = |cell: &Range<usize>| {
-            let mean = mean(&self.positions, cell);
-            // Rounding could lead out of the cell.
-            let of = |axis: usize| self.positions[cell.clone()].iter().map(move |it| it[axis]);
-            [0, 1, 2].map(|axis| {
-                let least = of(axis).fold(f32::INFINITY, f32::min);
-                let most = of(axis).fold(f32::NEG_INFINITY, f32::max);
-                mean[axis].clamp(least, most)
-            })
-        };
-        Self {
-            codes: cells
-                .par_iter()
-                .map(|cell| self.codes[cell.start])
-                .collect(),
-            positions: cells.par_iter().map(position).collect(),
-            normals: cells
-                .par_iter()
-                .map(|cell| mean(&self.normals, cell))
-                .collect(),
-            ..*self
-        }
-    }
-
-    /// The points in each cell.
-    pub fn cells(&self) -> impl Iterator<Item = Range<usize>> {
-        let mut end = 0;
-        self.codes.chunk_by(|a, b| a == b).map(move |cell| {
-            let begin = end;
-            end += cell.len();
-            begin..end
         })
     }
 

@@ -38,7 +38,7 @@ pub fn refine(
     (parents, parent_solution): (&Level, &[CornerValues]),
     level: &Level,
     samples: &Samples,
-    weights: &SampleWeights,
+    weights: &SampleWeights<'_>,
     coarse: &CoarseField,
     iterations: usize,
 ) -> Vec<CornerValues> {
@@ -55,7 +55,7 @@ pub fn refine(
 }
 
 impl System {
-    fn new(level: &Level, samples: &Samples, weights: &SampleWeights) -> Self {
+    fn new(level: &Level, samples: &Samples, weights: &SampleWeights<'_>) -> Self {
         let starts: Vec<usize> = (0..level.len()).step_by(CHUNK).collect();
         let constraints = starts
             .into_par_iter()
@@ -220,7 +220,7 @@ fn add_constraints(
     level: &Level,
     node: usize,
     samples: &Samples,
-    weights: &SampleWeights,
+    weights: &SampleWeights<'_>,
     constraints: &mut Vec<PointConstraint>,
 ) {
     let mut sums = [ConstraintSum::default(); CORNERS];

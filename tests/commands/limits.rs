@@ -130,7 +130,7 @@ fn a_budget_of_memory_that_does_not_suffice_is_an_error_that_names_what_needs_it
     let parts = ["would need", "more than the budget of 10.2 MiB", "--memory"];
     let build = || recording.fpmcl("build-map").with(TINY);
     let expected = |what, key| [&parts[..], &[what, key]].concat();
-    (build().set("depth", "8")).fails_with(&expected("the octree of the surface", "depth"));
+    build().fails_with(&expected("the octree of the surface", "depth"));
     (build().set("range_image.height", "1024")).fails_with(&expected("range images", "width"));
     (build().set("crop_x_m", "500"))
         .fails_with(&expected("the plane around a local map", "crop_x_m"));
